@@ -1,0 +1,136 @@
+"""Panels that several figures share: a CV with its setpoint, an MV, a bias; one run on one axes each."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+
+from figures import style
+
+HOUR = 3600.0
+
+
+def run_of(data: xr.Dataset, controller: str) -> xr.Dataset:
+    """One controller's part of the results."""
+    return data.sel(controller=controller)
+
+
+def run_colour(data: xr.Dataset, controller: str) -> str:
+    """The controller's colour."""
+    run = run_of(data, controller)
+    names = [str(name) for name in data.controller.values]
+    return style.colour(str(run.kind.item()), str(run.actuator.item()), names.index(controller))
+
+
+def time_axis(axes: Axes, start: float, end: float) -> float:
+    """Label the time axis in hours, or in minutes below four hours; returns the seconds in that unit."""
+    seconds, name = (60.0, "min") if end - start < 4 * HOUR else (HOUR, "h")
+    axes.set_xlabel(f"time [{name}]")
+    axes.set_xlim(start / seconds, end / seconds)
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=12, steps=[1, 2, 5, 10], integer=True))
+    return seconds
+
+
+def controlled(
+    axes: Axes, data: xr.Dataset, controller: str, cv: str, seconds: float, legend: bool = True
+) -> None:
+    """A measured CV, its setpoint dashed, and the deadzone of Soft MPC as a band where there is one."""
+    run = run_of(data, controller).sel(cv=cv)
+    t = data.time.values / seconds
+    ends = np.append(data.time.values, data.time.values[-1] + data.attrs["dt"]) / seconds
+    setpoint = _held(run.setpoint.values)
+    half = soft_half_width(run)
+    if half > 0:
+        name = f"deadzone ±{half:g} {style.unit(str(run.cv_unit.item()))}"
+        low, high = setpoint - half, setpoint + half
+        axes.fill_between(ends, low, high, step="post", color=style.BAND, linewidth=0, label=name)
+    axes.plot(
+        t,
+        run.measurement.values,
+        color=run_colour(data, controller),
+        linewidth=_width(data),
+        label="measured",
+    )
+    axes.step(
+        ends, setpoint, where="post", color=style.BLACK, linestyle="--", linewidth=1.0, label="setpoint"
+    )
+    axes.set_ylabel(style.label(cv, str(run.cv_unit.item())))
+    if legend:
+        axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=3, borderaxespad=0.1)
+
+
+def choke(axes: Axes, data: xr.Dataset, controller: str, seconds: float, legend: bool = True) -> None:
+    """Demanded and actual choke position."""
+    manipulated(axes, data, controller, "choke", seconds, demand=True, legend=legend)
+
+
+def manipulated(
+    axes: Axes,
+    data: xr.Dataset,
+    controller: str,
+    mv: str,
+    seconds: float,
+    demand: bool = False,
+    legend: bool = True,
+) -> None:
+    """An MV as the actuator holds it over each sample, with the controller's demand if asked for."""
+    run = run_of(data, controller).sel(mv=mv)
+    t = np.append(data.time.values, data.time.values[-1] + data.attrs["dt"]) / seconds
+    colour = run_colour(data, controller)
+    width = _width(data)
+    if demand:
+        axes.step(
+            t,
+            _held(run.demand.values),
+            where="post",
+            color=style.BLACK,
+            linewidth=0.6 * width,
+            label="demanded",
+        )
+    axes.step(t, _held(run.position.values), where="post", color=colour, linewidth=width, label="actual")
+    axes.set_ylabel(style.label(mv, str(run.mv_unit.item())))
+    if legend and demand:
+        axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=2, borderaxespad=0.1)
+
+
+def bias(axes: Axes, data: xr.Dataset, controller: str, cv: str, seconds: float) -> None:
+    """Filtered output bias v(k|k) of a CV."""
+    run = run_of(data, controller).sel(cv=cv)
+    axes.axhline(0, color=style.BLACK, linewidth=0.8)
+    t = data.time.values / seconds
+    axes.plot(t, run.bias.values, color=run_colour(data, controller), linewidth=_width(data))
+    axes.set_ylabel("bias of the " + style.label(cv, str(run.cv_unit.item())))
+
+
+def soft_half_width(run: xr.Dataset) -> float:
+    """Half width of the deadzone of one run and CV, 0 without Soft MPC."""
+    soft = float(run.tuning_soft_quadratic) + float(run.tuning_soft_linear)
+    return float(run.tuning_deadzone) if soft > 0 else 0.0
+
+
+def _held(values: np.ndarray) -> np.ndarray:
+    """Values held over their samples: the last one once more, for the end of the last sample."""
+    return np.append(values, values[-1])
+
+
+def limits(axes: Axes, *values: xr.DataArray) -> None:
+    """Vertical limits that hold all given values, so that figures of several controllers compare."""
+    low = min(float(value.min()) for value in values)
+    high = max(float(value.max()) for value in values)
+    margin = 0.05 * (high - low) or 1.0
+    axes.set_ylim(low - margin, high + margin)
+    axes.yaxis.set_major_locator(MaxNLocator(nbins=7, steps=[1, 2, 5, 10]))
+
+
+def _width(data: xr.Dataset) -> float:
+    """Line width: thinner where thousands of samples share the page."""
+    return 0.9 if data.sizes["time"] > 2000 else 1.3
+
+
+def changes(axes: Axes, data: xr.Dataset, seconds: float) -> None:
+    """Thin lines where the setpoints change."""
+    window = data.window.values
+    for k in np.flatnonzero(np.diff(window)) + 1:
+        axes.axvline(data.time.values[k] / seconds, color=style.GREY, linewidth=0.5, alpha=0.6)

@@ -1,0 +1,124 @@
+"""How every figure looks: colours by controller, setpoints dashed, deadzones as bands, units on every axis.
+
+The colours are the Okabe-Ito set, which stays apart for colour-blind readers and in grey. Everything is drawn
+with the Agg backend and written as PNG and PDF, each file in one go.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxmpc.files import write_atomically
+
+BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
+ORANGE, SKY, PURPLE, BLACK, GREY = "#E69F00", "#56B4E9", "#CC79A7", "#222222", "#7F7F7F"
+BAND = "#E3E3E3"
+
+# by what the controller is, so that the same controller has the same colour in every study
+CONTROLLER_COLOURS = {
+    ("continuous", "continuous"): BLUE,
+    ("continuous", "step"): VERMILLION,
+    ("mixed-integer", "step"): GREEN,
+}
+SPARE_COLOURS = (PURPLE, ORANGE, SKY)
+SERIES = ((BLUE, "-"), (ORANGE, "--"), (GREEN, "-."))  # three curves of one kind
+VERDICT_COLOURS = {
+    "holds": GREEN,
+    "holds in part": ORANGE,
+    "does not hold": VERMILLION,
+    "not tested": GREY,
+}
+
+NAMES = {"gas_rate": "gas rate", "oil_rate": "oil rate", "choke": "choke", "gas_lift": "gas lift"}
+UNITS = {"m3/h": "m³/h"}
+
+RC = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9.0,
+    "axes.titlesize": 10.0,
+    "axes.labelsize": 9.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#EBEBEB",
+    "grid.linewidth": 0.7,
+    "lines.linewidth": 1.3,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "figure.constrained_layout.use": True,
+    "figure.dpi": 100,
+    "savefig.dpi": 160,
+    "pdf.fonttype": 42,
+    "svg.hashsalt": "jaxmpc",
+}
+
+
+@contextlib.contextmanager
+def figure(
+    rows: int, width: float = 7.6, row_height: float = 2.2, **options
+) -> Iterator[tuple[Figure, list[Axes]]]:
+    """A figure of stacked panels in the house style; closed at the end.
+
+    Args:
+        rows: number of panels.
+        width: of the figure [inch].
+        row_height: of one panel [inch].
+        **options: for `matplotlib.pyplot.subplots`.
+    """
+    with plt.rc_context(RC):
+        options = {"sharex": True, **options}
+        drawn, axes = plt.subplots(
+            rows, 1, figsize=(width, row_height * rows + 0.5), squeeze=False, **options
+        )
+        try:
+            yield drawn, list(axes[:, 0])
+        finally:
+            plt.close(drawn)
+
+
+def save(drawn: Figure, out: str | Path, name: str) -> list[Path]:
+    """Write ``name.png`` and ``name.pdf`` into a folder; equal figures give equal files.
+
+    Returns:
+        The two paths.
+    """
+    paths = []
+    for kind, metadata in (("png", {"Software": None}), ("pdf", {"CreationDate": None, "Producer": None})):
+        buffer = io.BytesIO()
+        drawn.savefig(buffer, format=kind, metadata=metadata)
+        paths.append(write_atomically(Path(out) / f"{name}.{kind}", buffer.getvalue()))
+    return paths
+
+
+def colour(kind: str, actuator: str, position: int = 0) -> str:
+    """Colour of a controller; `position` tells further kinds apart."""
+    return CONTROLLER_COLOURS.get((kind, actuator), SPARE_COLOURS[position % len(SPARE_COLOURS)])
+
+
+def unit(text: str) -> str:
+    """A unit as it is printed."""
+    return UNITS.get(text, text)
+
+
+def printed(text: str) -> str:
+    """A sentence with its units as they are printed."""
+    for plain, shown in UNITS.items():
+        text = text.replace(plain, shown)
+    return text.replace(" %", "\N{NO-BREAK SPACE}%")
+
+
+def label(name: str, unit_text: str) -> str:
+    """An axis label with its unit: ``gas rate [m³/h]``."""
+    return f"{NAMES.get(name, name.replace('_', ' '))} [{unit(unit_text)}]"

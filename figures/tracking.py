@@ -1,0 +1,66 @@
+"""Thesis figures 14, 17, 22 (rates), 15, 18, 23 (inputs) and 16, 19, 24 (bias), of one closed loop each."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+
+import xarray as xr
+from matplotlib.figure import Figure
+
+from figures import panels, style
+
+
+def _span(data: xr.Dataset) -> tuple[float, float]:
+    return float(data.time.values[0]), float(data.time.values[-1]) + float(data.attrs["dt"])
+
+
+@contextlib.contextmanager
+def rates(data: xr.Dataset, controller: str) -> Iterator[Figure]:
+    """Measured CVs with their setpoints and deadzones; limits that hold every controller in `data`.
+
+    Args:
+        data: results, whole or a stretch of time or of controllers.
+        controller: name of a finished run.
+    """
+    names = [str(name) for name in data.cv.values][::-1]  # oil above gas, as in the thesis
+    with _stack(data, controller, len(names)) as (drawn, axes, seconds):
+        for ax, cv in zip(axes, names, strict=True):
+            panels.controlled(ax, data, controller, cv, seconds)
+            run = data.sel(controller=controller, cv=cv)
+            half = panels.soft_half_width(run)
+            panels.limits(ax, data.measurement.sel(cv=cv), run.setpoint - half, run.setpoint + half)
+            panels.changes(ax, data, seconds)
+        yield drawn
+
+
+@contextlib.contextmanager
+def inputs(data: xr.Dataset, controller: str) -> Iterator[Figure]:
+    """Demanded and actual choke position, and the lift rate; arguments of `rates`."""
+    with _stack(data, controller, 2) as (drawn, axes, seconds):
+        panels.choke(axes[0], data, controller, seconds)
+        panels.manipulated(axes[1], data, controller, "gas_lift", seconds)
+        for ax, mv in zip(axes, ("choke", "gas_lift"), strict=True):
+            panels.limits(ax, data.position.sel(mv=mv), data.demand.sel(mv=mv))
+            panels.changes(ax, data, seconds)
+        yield drawn
+
+
+@contextlib.contextmanager
+def bias(data: xr.Dataset, controller: str) -> Iterator[Figure]:
+    """Filtered output bias of both CVs; arguments of `rates`."""
+    names = [str(name) for name in data.cv.values][::-1]
+    with _stack(data, controller, len(names)) as (drawn, axes, seconds):
+        for ax, cv in zip(axes, names, strict=True):
+            panels.bias(ax, data, controller, cv, seconds)
+            panels.limits(ax, data.bias.sel(cv=cv))
+            panels.changes(ax, data, seconds)
+        yield drawn
+
+
+@contextlib.contextmanager
+def _stack(data: xr.Dataset, controller: str, rows: int):
+    with style.figure(rows) as (drawn, axes):
+        drawn.suptitle(str(data.label.sel(controller=controller).item()), fontsize=10)
+        seconds = panels.time_axis(axes[-1], *_span(data))
+        yield drawn, axes, seconds

@@ -1,0 +1,264 @@
+"""Fitting the well model to published step responses: how the shipped parameters were found (thesis 4.1).
+
+`fit_well` adjusts the uncertain parameters until the model's own step responses, simulated with the plant's
+Runge-Kutta steps, match given ones. The least-squares Jacobian is the exact derivative of that simulation.
+Step responses at one working point do not determine every parameter, so each keeps to a prior, the shipped
+well, within its uncertainty. Run ``python -m identify.fit DATA.json --out WELL.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmpc.errors import InputError
+from jaxmpc.plant import STATE_SCALE, check_inputs, rates, runge_kutta, steady_state
+from jaxmpc.plant import WellPlant, _JaxOps
+from jaxmpc.step_response import FORMAT, StepResponseModel, make_model
+from jaxmpc.well import (
+    CV_NAMES,
+    DEFAULT_CHOKE,
+    DEFAULT_LIFT,
+    MV_NAMES,
+    WellParameters,
+    model,
+    parameters_to_dict,
+    save_parameters,
+)
+
+STEPS = (2.0, 100.0)  # choke [%] and lift [m3/h], as in the thesis
+RESPONSE_ERROR = 0.02  # standard error of a response, as a share of its peak
+RATE_ERROR = 0.01  # relative standard error of the steady rates, where the data give them
+
+# Relative uncertainty of the parameters that are fitted; the two shape coefficients are absolute.
+UNCERTAINTY = {
+    "tubing_length": 0.1,
+    "tubing_diameter": 0.1,
+    "annulus_volume": 0.2,
+    "perforation_depth": 0.2,
+    "reservoir_pressure": 0.05,
+    "productivity": 0.2,
+    "near_well_resistance": 0.3,
+    "near_well_time": 0.3,
+    "gas_oil_ratio": 0.2,
+    "choke_conductance": 0.1,
+    "choke_linear": 0.1,
+    "choke_quick": 0.1,
+    "manifold_pressure": 0.1,
+    "friction_factor": 0.2,
+    "injection_conductance": 0.2,
+    "supply_pressure": 0.1,
+    "supply_droop": 0.3,
+    "slip_base": 0.1,
+    "slip_velocity": 0.3,
+    "slip_floor": 0.3,
+    "choke_time": 0.3,
+    "lift_time": 0.3,
+    "gas_meter": 0.1,
+}
+ABSOLUTE = ("choke_linear", "choke_quick")
+
+
+class StepData(NamedTuple):
+    """Step responses to fit to.
+
+    Attributes:
+        coefficients: ``"cv mv n"``, S(1)..S(n), CV change at 1..n samples after a unit step.
+        dt: sampling interval [s].
+        choke, lift: working point [%, m3/h].
+        rates: steady gas and oil rates at the working point [m3/h], or None if they are not known.
+    """
+
+    coefficients: np.ndarray
+    dt: float
+    choke: float
+    lift: float
+    rates: np.ndarray | None
+
+
+class Fit(NamedTuple):
+    """Result of `fit_well`.
+
+    Attributes:
+        parameters: the fitted well.
+        r_squared: ``"cv mv"``, share of the variance of each response that the well reproduces.
+        largest_error: ``"cv mv"``, as a share of the response's peak [1].
+        response: ``"cv mv n"``, the well's own step responses.
+        cost: half the sum of squared weighted errors, before each step and at the end.
+        converged: whether the last step changed no parameter by more than 1e-4 of its uncertainty.
+    """
+
+    parameters: WellParameters
+    r_squared: np.ndarray
+    largest_error: np.ndarray
+    response: np.ndarray
+    cost: list[float]
+    converged: bool
+
+
+def load_step_data(path: str | Path) -> StepData:
+    """Read step responses, either a model written by `StepResponseModel.save` or a published table.
+
+    A published table is a JSON object with ``coefficients[cv][mv][n]`` (entry k is the CV change k samples
+    after a unit step, so that entry 0 is zero), ``sampling_seconds``, and the names ``cv`` and ``mv``, which
+    start with gas and oil, and choke and gas lift. Optional: ``working_point`` with ``choke`` [%] and
+    ``gas_lift`` [m3/h] (50 and 7500 by default), and ``gas_rate`` and ``oil_rate`` [m3/h].
+
+    Raises:
+        InputError: naming the field that is wrong.
+    """
+    try:
+        body = json.loads(Path(path).read_text())
+    except (OSError, ValueError) as error:
+        raise InputError("step-response file", str(path), f"a readable JSON file ({error})") from error
+    if not isinstance(body, dict):
+        raise InputError("step-response file", str(path), "a JSON object")
+    if body.get("format") == FORMAT:
+        table = StepResponseModel.load(path)
+        point, coefficients = dict(table.working_point), np.asarray(table.coefficients)
+    else:
+        for key in ("coefficients", "sampling_seconds", "cv", "mv"):
+            if key not in body:
+                raise InputError(f"data.{key}", "nothing", "a value (the key is missing)")
+        table = make_model(
+            body["coefficients"], body["sampling_seconds"], body["cv"], body["mv"], path="data"
+        )
+        point, coefficients = body.get("working_point", {}), np.asarray(table.coefficients)
+        largest = np.abs(coefficients).max(axis=-1)
+        if (np.abs(coefficients[..., 0]) > 1e-6 * largest).any() or coefficients.shape[-1] < 2:
+            raise InputError(
+                "data.coefficients", coefficients[..., 0].tolist(), "entry 0, at the instant of the step, to be 0"
+            )
+        coefficients = coefficients[..., 1:]
+    for key, names, starts in (("cv", table.cv_names, ("gas", "oil")), ("mv", table.mv_names, ("choke", "gas"))):
+        if len(names) != 2 or not all(n.lower().startswith(s) for n, s in zip(names, starts, strict=True)):
+            raise InputError(f"data.{key}", list(names), f"two names that start with {starts[0]} and {starts[1]}")
+    choke, lift = point.get("choke", DEFAULT_CHOKE), point.get("gas_lift", DEFAULT_LIFT)
+    check_inputs(choke, lift)
+    check_inputs(choke + STEPS[0], lift + STEPS[1])
+    known = [point.get(name) for name in CV_NAMES]
+    measured = None if None in known else np.array(known, dtype=np.float64)
+    if measured is not None and not (np.isfinite(measured).all() and (measured > 0).all()):
+        raise InputError("data.working_point", known, "gas and oil rates above zero [m3/h]")
+    if (np.abs(coefficients).max(axis=-1) == 0).any():
+        raise InputError("data.coefficients", "a response of zeros", "four responses that move")
+    return StepData(coefficients, table.dt, float(choke), float(lift), measured)
+
+
+def _measure(x, u, parameters):
+    return jnp.stack(model(_JaxOps, tuple(x), tuple(u), parameters)[1][:2])
+
+
+def _simulate(parameters: WellParameters, x0, data: StepData):
+    """Steady rates, and step responses ``"cv mv n"``, as a differentiable function of the parameters."""
+    scale = jnp.asarray(STATE_SCALE)
+    here = jnp.array([data.choke, data.lift, 0.0])
+
+    def drift(s, parameters):
+        return rates(s * scale, here, parameters) / scale
+
+    # One Newton step from the solution gives its derivative: dx = -J^-1 df.
+    s = jax.lax.stop_gradient(x0 / scale)
+    jacobian = jax.lax.stop_gradient(jax.jacfwd(drift)(s, parameters))
+    x0 = (s - jnp.linalg.solve(jacobian, drift(s, parameters))) * scale
+    steady = _measure(x0, here, parameters)
+
+    def response(step):
+        u = here + step
+
+        def sample(x, _):
+            x = jnp.stack(runge_kutta(tuple(x), tuple(u), parameters, round(data.dt), 1.0))
+            return x, _measure(x, u, parameters)
+
+        _, cv = jax.lax.scan(sample, x0, length=data.coefficients.shape[-1])
+        return ((cv - steady) / jnp.sum(step)).T
+
+    changes = jnp.array([[STEPS[0], 0.0, 0.0], [0.0, STEPS[1], 0.0]])
+    return steady, jnp.stack([response(change) for change in changes], axis=1)
+
+
+def _unpack(theta, prior: WellParameters) -> WellParameters:
+    """Parameters from the fitted vector, whose entries count uncertainties away from the prior."""
+    changed = {}
+    for value, (name, width) in zip(theta, UNCERTAINTY.items(), strict=True):
+        centre = getattr(prior, name)
+        changed[name] = centre + width * value if name in ABSOLUTE else centre * jnp.exp(width * value)
+    body = {**parameters_to_dict(prior), **changed}
+    return WellParameters(**body)
+
+
+def fit_well(data: StepData, prior: WellParameters | None = None, steps: int = 30) -> Fit:
+    """Fit the well to step responses by Levenberg-Marquardt.
+
+    Minimises the squared errors of the four responses (weighted with `RESPONSE_ERROR` of their peaks), of the
+    steady rates where they are known (`RATE_ERROR`), and of the parameters against the prior (`UNCERTAINTY`).
+
+    Args:
+        data: from `load_step_data`; its sampling interval must be a whole number of seconds.
+        prior: where to start and what to stay near; the shipped well by default.
+        steps: most iterations.
+
+    Raises:
+        InputError: for a sampling interval that is not a whole number of seconds.
+    """
+    if abs(data.dt - round(data.dt)) > 1e-9 or data.dt < 1:
+        raise InputError("data.sampling_seconds", data.dt, "a whole number of seconds")
+    prior = WellParameters() if prior is None else prior
+    peak = jnp.asarray(np.abs(data.coefficients).max(axis=-1, keepdims=True))
+
+    @jax.jit
+    def solve(theta, guess):
+        found = steady_state(data.choke, data.lift, 0.0, _unpack(theta, prior), guess)
+        return found.x, found.converged
+
+    def errors(theta, x0):
+        steady, response = _simulate(_unpack(theta, prior), x0, data)
+        # The samples of a response are not independent: all of them together count as ten.
+        weight = jnp.sqrt(10.0 / data.coefficients.shape[-1]) / (RESPONSE_ERROR * peak)
+        parts = [((response - data.coefficients) * weight).ravel(), theta]
+        if data.rates is not None:
+            parts.append((steady / data.rates - 1) / RATE_ERROR)
+        return jnp.concatenate(parts), response
+
+    value = jax.jit(errors)
+    slope = jax.jit(jax.jacfwd(lambda theta, x0: errors(theta, x0)[0]))
+    theta, damping = jnp.zeros(len(UNCERTAINTY)), 1e-3
+    x0, _ = solve(theta, None)
+    current, response = value(theta, x0)
+    cost, converged = [0.5 * float(current @ current)], False
+    for _ in range(steps):
+        jacobian = slope(theta, x0)
+        normal, gradient = jacobian.T @ jacobian, jacobian.T @ current
+        while damping < 1e8:
+            move = -jnp.linalg.solve(normal + damping * jnp.diag(jnp.diag(normal)), gradient)
+            x_new, found = solve(theta + move, x0)
+            trial, trial_response = value(theta + move, x_new)
+            cost_new = 0.5 * float(trial @ trial)
+            if bool(found) and np.isfinite(cost_new) and cost_new <= cost[-1]:
+                break
+            damping *= 10.0
+        else:
+            break  # no step improves the fit any more
+        theta, x0, current, response = theta + move, x_new, trial, trial_response
+        cost.append(cost_new)
+        damping = max(damping / 10.0, 1e-9)
+        converged = bool(jnp.max(jnp.abs(move)) < 1e-4)
+        if converged:
+            break
+    fitted = _unpack(theta, prior)
+    fitted = WellParameters(**{k: float(v) for k, v in parameters_to_dict(fitted).items()})
+    return _report(fitted, np.asarray(response), data, cost, converged)
+
+
+def _report(parameters, response, data: StepData, cost, converged) -> Fit:
+    error = response - data.coefficients
+    variance = ((data.coefficients - data.coefficients.mean(axis=-1, keepdims=True)) ** 2).sum(axis=-1)
+    largest = np.abs(error).max(axis=-1) / np.abs(data.coefficients).max(axis=-1)
+    return Fit(parameters, 1 - (error**2).sum(axis=-1) / variance, largest, response, cost, converged)

@@ -1,0 +1,252 @@
+"""The command line: reads files and options, calls the packages, writes files, and sets the exit status.
+
+This is the one module of `jaxmpc` that may import the other packages. Everything heavy is imported inside the
+command that needs it, so that ``--help`` and wrong options answer at once. Bad input ends with one line on
+standard error and exit status 2, a missing tool with status 1; nothing is written in either case.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from jaxmpc.errors import InputError, MissingToolError
+
+EXIT_OPTIMAL, EXIT_OTHER, EXIT_BAD_INPUT, EXIT_INFEASIBLE, EXIT_LIMIT = 0, 1, 2, 3, 4
+FINISHES = ("auto", "enumeration", "highs", "branch-and-bound")
+PLANTS = ("fmu", "jax")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command.
+
+    Args:
+        arguments: words after ``jaxmpc``; those of the process if not given.
+
+    Returns:
+        The exit status: 0 done (for `plan`: optimal), 2 bad input with nothing written, 3 infeasible, 4 limit
+        reached with a feasible plan, 1 anything else.
+    """
+    options = _parser().parse_args(arguments)
+    try:
+        return options.run(options)
+    except InputError as error:
+        return _complain(error, EXIT_BAD_INPUT)
+    except MissingToolError as error:
+        return _complain(error, EXIT_OTHER)
+    except BrokenPipeError:  # the reader of standard output has left
+        sys.stderr.close()
+        return EXIT_OTHER
+
+
+def _complain(error: Exception, status: int) -> int:
+    print("jaxmpc: " + " ".join(str(error).split()), file=sys.stderr)
+    return status
+
+
+def _parser() -> argparse.ArgumentParser:
+    formatter = argparse.ArgumentDefaultsHelpFormatter
+    parser = argparse.ArgumentParser(
+        prog="jaxmpc", description="Model predictive control with discrete actuators.", allow_abbrev=False
+    )
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+    def command(group, name, run, help, **more):
+        made = group.add_parser(
+            name, help=help, description=help, formatter_class=formatter, allow_abbrev=False, **more
+        )
+        made.set_defaults(run=run)
+        return made
+
+    def family(name, help):
+        made = commands.add_parser(name, help=help, description=help, allow_abbrev=False)
+        return made.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+    plan = command(
+        commands,
+        "plan",
+        _plan,
+        "Solve one controller step from a case file (JSON, engineering units).",
+        epilog="Exit status: 0 optimal, 2 bad input (nothing is written), 3 infeasible, 4 time limit reached "
+        "with a feasible plan, 1 anything else.",
+    )
+    plan.add_argument("case", metavar="CASE.json", type=Path, help="the case file")
+    plan.add_argument(
+        "--out", metavar="PLAN.json", type=Path, default=argparse.SUPPRESS, help=_default("standard output")
+    )
+    plan.add_argument(
+        "--finish",
+        choices=FINISHES,
+        default="auto",
+        help="how integer moves are decided; each way alone is exact",
+    )
+
+    fmu = family("fmu", "Build the well as an FMU.")
+    build = command(
+        fmu, "build", _fmu_build, "Build the gas-lifted well as a co-simulation FMU; needs a C compiler."
+    )
+    build.add_argument("--fmi", type=int, choices=(2, 3), default=2, help="major version of FMI")
+    build.add_argument(
+        "--out",
+        metavar="FILE.fmu",
+        type=Path,
+        default=argparse.SUPPRESS,
+        help=_default("the cache of built FMUs"),
+    )
+
+    identify = command(
+        commands,
+        "identify",
+        _identify,
+        "Identify a step-response model: settle the plant and step each MV alone.",
+    )
+    identify.add_argument("--plant", choices=PLANTS, default="fmu", help="the FMU or the JAX well")
+    identify.add_argument(
+        "--choke", metavar="PERCENT", type=float, default=50.0, help="choke to start from [%%]"
+    )
+    identify.add_argument(
+        "--lift", metavar="RATE", type=float, default=7500.0, help="lift to start from [m3/h]"
+    )
+    identify.add_argument(
+        "--steps",
+        metavar=("CHOKE", "LIFT"),
+        type=float,
+        nargs=2,
+        default=(2.0, 100.0),
+        help="steps of choke [%%] and lift [m3/h]",
+    )
+    identify.add_argument(
+        "--samples", metavar="N", type=int, default=250, help="coefficients N [samples of 10 s]"
+    )
+    identify.add_argument(
+        "--out", metavar="MODEL.json", type=Path, default=Path("model.json"), help="where to write"
+    )
+
+    study = family("study", "Run studies.")
+    run = study.add_parser("run", help="Run a study.", description="Run a study.", allow_abbrev=False)
+    studies = run.add_subparsers(title="studies", metavar="STUDY", required=True)
+    thesis = command(
+        studies,
+        "thesis",
+        _study_thesis,
+        "Compare continuous and mixed-integer MPC on the well over 78,000 s and draw the figures.",
+    )
+    thesis.add_argument(
+        "--out", metavar="DIR", type=Path, default=Path("results"), help="where results and figures go"
+    )
+    thesis.add_argument("--quick", action="store_true", help="a shortened reference, under two minutes")
+    thesis.add_argument("--plant", choices=PLANTS, default="fmu", help="drive the FMU or its JAX twin")
+    return parser
+
+
+def _default(text: str) -> str:
+    return f"where to write (default: {text})"
+
+
+def _plan(options: argparse.Namespace) -> int:
+    out = getattr(options, "out", None)
+    if out is not None:
+        _check_writable("--out", out)
+    from jaxmpc.case import load_case, plan_to_dict
+    from jaxmpc.files import write_atomically
+
+    case = load_case(options.case)
+    from jaxmpc.plan import solve_plan
+
+    plan = solve_plan(
+        case.model,
+        case.structure,
+        case.tuning,
+        mv_now=case.mv_now,
+        last_move=case.last_move,
+        free_response=case.free_response,
+        setpoint=case.setpoint,
+        previous_moves=case.previous_moves,
+        time_limit=case.time_limit,
+        gap=case.gap,
+        finish=options.finish,
+    )
+    body = plan_to_dict(plan)
+    text = _lines(body)
+    if out is None:
+        print(text, end="", flush=True)
+    else:
+        write_atomically(out, text)
+        print(
+            f"jaxmpc: {body['status']}, objective {body['objective']}, gap {body['gap']}: {out}",
+            file=sys.stderr,
+        )
+    if body["status"] == "limit" and body["objective"] is None:
+        return EXIT_OTHER  # the limit came before any feasible plan
+    return {"optimal": EXIT_OPTIMAL, "infeasible": EXIT_INFEASIBLE, "limit": EXIT_LIMIT}.get(
+        body["status"], EXIT_OTHER
+    )
+
+
+def _lines(body: dict[str, Any]) -> str:
+    """JSON with one field per line."""
+    fields = (f" {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in body.items())
+    return "{\n" + ",\n".join(fields) + "\n}\n"
+
+
+def _check_writable(field: str, path: Path) -> None:
+    """Refuse a file that could not be written later; nothing is left behind."""
+    if path.is_dir():
+        raise InputError(field, str(path), "a file, not a folder")
+    folder = path.absolute().parent
+    while not folder.exists():
+        folder = folder.parent
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(
+            field, str(path), f"a file in a folder that can be written ({error.strerror})"
+        ) from None
+
+
+def _fmu_build(options: argparse.Namespace) -> int:
+    from identify.fmu import build_fmu
+
+    out = getattr(options, "out", None)
+    if out is not None:
+        _check_writable("--out", out)
+    print(build_fmu(fmi=options.fmi, out=out))
+    return EXIT_OPTIMAL
+
+
+def _identify(options: argparse.Namespace) -> int:
+    _check_writable("--out", options.out)
+    import contextlib
+
+    from identify.step_test import identify_step_response, settling_notes
+
+    with contextlib.ExitStack() as stack:
+        plant = None  # the JAX well
+        if options.plant == "fmu":
+            from identify.fmu import FmuPlant
+
+            plant = stack.enter_context(FmuPlant())
+        model = identify_step_response(
+            plant, options.choke, options.lift, tuple(options.steps), options.samples
+        )
+    for note in settling_notes(model):
+        print(f"jaxmpc: {note}", file=sys.stderr)
+    print(model.save(options.out))
+    return EXIT_OPTIMAL
+
+
+def _study_thesis(options: argparse.Namespace) -> int:
+    _check_writable("--out", options.out / "results")
+    from studies.thesis import run_thesis
+
+    run_thesis(options.out, options.quick, options.plant)
+    return EXIT_OPTIMAL
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,28 @@
+"""Errors that say what to do: one type for bad input, one for a missing tool. Raised by every package."""
+
+from __future__ import annotations
+
+
+class InputError(ValueError):
+    """Bad input, refused before anything is computed or overwritten.
+
+    Args:
+        field: path of the offending field, for example ``tuning.cv_weight[1]``.
+        value: the value that was given.
+        expected: what was expected, with the unit.
+        hint: what to do about it (optional).
+    """
+
+    def __init__(self, field: str, value: object, expected: str, hint: str = ""):
+        self.field, self.value, self.expected, self.hint = field, value, expected, hint
+        shown = repr(value)
+        if len(shown) > 120:
+            shown = shown[:117] + "..."
+        super().__init__(f"{field}: got {shown}, expected {expected}" + (f". {hint}" if hint else ""))
+
+    def __reduce__(self):
+        return type(self), (self.field, self.value, self.expected, self.hint)
+
+
+class MissingToolError(RuntimeError):
+    """A program outside Python (a compiler, cmake) is missing; the message says what to install."""

@@ -1,0 +1,151 @@
+"""HiGHS, the one importer of `highspy`: the reduced mixed-integer linear programme over the moves left free.
+
+The problem over whole moves is V(d) = sum_i own_i(d_i) + R(d) with R convex. One binary per admissible value of a free
+move makes any separable term exactly linear (for -1/0/1 these are the usual p and q with move = p - q), and cuts
+of R from solved problems bound the rest from below (outer approximation, Duran and Grossmann 1986).
+"""
+
+from __future__ import annotations
+
+import highspy
+import numpy as np
+
+from jaxmpc.propagation import Chain
+
+
+class ReducedMilp:
+    """min sum own_i(d_i) + theta over the whole moves that are still free; theta is bounded below by cuts.
+
+    Args:
+        chains: hard rows.
+        lower, upper: integer limits of all moves; equal limits fix a move.
+        own: ``"integer value"`` separable cost, column v for the move `lower + v`.
+        unit: objective values are divided by this before HiGHS sees them.
+    """
+
+    def __init__(self, chains: list[Chain], lower: np.ndarray, upper: np.ndarray, own: np.ndarray, unit: float):
+        self.lower, self.upper, self.unit = lower, upper, unit
+        self.free = np.flatnonzero(upper > lower)
+        self.base = float(sum(own[i, 0] for i in range(len(lower)))) / unit
+        self.first_column = {}
+        highs = self.highs = highspy.Highs()
+        for option, value in (
+            ("output_flag", False),
+            ("threads", 1),
+            ("mip_rel_gap", 1e-9),
+            ("mip_abs_gap", 1e-10),
+            ("mip_feasibility_tolerance", 1e-9),
+            ("primal_feasibility_tolerance", 1e-9),
+            ("dual_feasibility_tolerance", 1e-9),
+        ):
+            highs.setOptionValue(option, value)
+        highs.addVar(-1e6, 1e9)  # theta
+        highs.changeColCost(0, 1.0)
+        column = 1
+        for i in self.free:
+            self.first_column[i] = column
+            width = int(upper[i] - lower[i])
+            for v in range(1, width + 1):
+                highs.addVar(0.0, 1.0)
+                highs.changeColIntegrality(column, highspy.HighsVarType.kInteger)
+                highs.changeColCost(column, float(own[i, v] - own[i, 0]) / unit)
+                column += 1
+            if width > 1:
+                self._row(-np.inf, 1.0, np.arange(column - width, column), np.ones(width))
+        self._hard_rows(chains)
+
+    def _row(self, low: float, high: float, index: np.ndarray, value: np.ndarray) -> None:
+        self.highs.addRow(low, high, len(index), np.asarray(index, dtype=np.int32), np.asarray(value, dtype=float))
+
+    def _in_binaries(self, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Columns, values and constant of a linear form in the moves."""
+        index, value = [], []
+        for i in self.free:
+            if coefficients[i] != 0.0:
+                width = int(self.upper[i] - self.lower[i])
+                index.append(self.first_column[i] + np.arange(width))
+                value.append(coefficients[i] * np.arange(1, width + 1))
+        constant = float(coefficients @ self.lower)
+        if not index:
+            return np.zeros(0, dtype=int), np.zeros(0), constant
+        return np.concatenate(index), np.concatenate(value), constant
+
+    def _hard_rows(self, chains: list[Chain]) -> None:
+        for chain in chains:
+            blocks = len(chain.columns)
+            forms = []
+            for b in range(blocks):
+                form = np.zeros(blocks)
+                form[: b + 1] = chain.counts[: b + 1]
+                forms.append((form, chain.low[b], chain.high[b]))
+                if chain.coupled[b]:
+                    form = np.zeros(blocks)
+                    form[b - 1], form[b] = -1.0, 1.0
+                    forms.append((form, -1.0, 1.0))
+            forms += list(zip(chain.windows, chain.window_low, chain.window_high, strict=True))
+            for form, low, high in forms:
+                wide = np.zeros(len(self.lower))
+                wide[chain.columns] = form
+                index, value, constant = self._in_binaries(wide)
+                most = constant + np.maximum(wide * (self.upper - self.lower), 0.0).sum()
+                least = constant + np.minimum(wide * (self.upper - self.lower), 0.0).sum()
+                if len(index) and (most > high + 1e-9 or least < low - 1e-9):
+                    self._row(low - constant, high - constant, index, value)
+
+    def add_cut(self, value: float, at: np.ndarray, gradient: np.ndarray) -> None:
+        """theta >= value + gradient'(d - at)."""
+        index, slope, constant = self._in_binaries(gradient / self.unit)
+        right = value / self.unit - gradient @ at / self.unit + constant
+        self._row(right, np.inf, np.concatenate([[0], index]), np.concatenate([[1.0], -slope]))
+
+    def forbid(self, point: np.ndarray) -> None:
+        """No-good cut: at least one free move differs from `point`."""
+        index, value, right = [], [], 1.0
+        for i in self.free:
+            width = int(self.upper[i] - self.lower[i])
+            columns = self.first_column[i] + np.arange(width)
+            chosen = int(point[i] - self.lower[i])
+            if chosen == 0:  # differs when any binary is one
+                index.append(columns)
+                value.append(np.ones(width))
+            else:
+                index.append(columns[chosen - 1 : chosen])
+                value.append(-np.ones(1))
+                right -= 1.0
+        if index:
+            self._row(right, np.inf, np.concatenate(index), np.concatenate(value))
+        else:
+            self._row(1.0, np.inf, np.zeros(0, dtype=int), np.zeros(0))
+
+    def solve(self, seconds: float | None) -> tuple[float, np.ndarray | None, bool]:
+        """Solve the present master.
+
+        Args:
+            seconds: time limit, None for none.
+            cutoff: nothing at or above this value is of interest.
+
+        Returns:
+            ``(bound, point, finished)``: a lower bound of everything not forbidden, the best whole moves (None
+            if there are none below the cutoff), and whether HiGHS finished.
+        """
+        self.highs.setOptionValue("time_limit", 1e30 if seconds is None else float(self.highs.getRunTime() + max(seconds, 1e-3)))
+        self.highs.run()
+        status = self.highs.getModelStatus()
+        info = self.highs.getInfo()
+        if status == highspy.HighsModelStatus.kInfeasible:
+            return np.inf, None, True
+        finished = status == highspy.HighsModelStatus.kOptimal
+        bound = info.mip_dual_bound if len(self.free) else info.objective_function_value
+        if not np.isfinite(bound) or abs(bound) > 1e15:
+            bound = -1e6
+        # HiGHS is right to its tolerances: hand on a bound that is a little lower
+        value = (self.base + bound - 1e-8 * (1.0 + abs(bound))) * self.unit
+        solution = self.highs.getSolution().col_value
+        point = None
+        if len(solution) and info.primal_solution_status == 2:
+            point = self.lower.copy()
+            for i in self.free:
+                width = int(self.upper[i] - self.lower[i])
+                columns = np.asarray(solution[self.first_column[i] : self.first_column[i] + width])
+                point[i] = self.lower[i] + int(np.round(columns @ np.arange(1, width + 1)))
+        return value, point, finished

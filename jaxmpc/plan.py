@@ -1,0 +1,380 @@
+"""One controller step: from free response and setpoint to a plan with its certificate (thesis 5.3, 6.1).
+
+`Planner` keeps what is constant between samples; the controllers and the `plan` command call it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxmpc import status as codes
+from jaxmpc.blocking import moves_per_block, position_rows, sample_moves
+from jaxmpc.condense import DRIFT, QpInstance, condense, dynamic_matrix, integer_columns, make_instance
+from jaxmpc.errors import InputError
+from jaxmpc.integer import FINISHES, Constants, SearchResult, Search, continuous_feasible, solve_integer
+from jaxmpc.step_response import StepResponseModel
+from jaxmpc.structure import Structure
+from jaxmpc.tuning import Tuning
+
+WIDEST_ENVELOPE = 4  # steps up to which the envelope of the squared integer move is built
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """A solved controller step, in engineering units.
+
+    Attributes:
+        status: ``optimal``, ``limit`` (feasible, not proven within the gap), ``infeasible`` or ``failed``.
+        objective: (6.6) with all constants; None without a plan.
+        bound: proven lower bound of the objective.
+        gap: relative gap between the two.
+        moves: per-sample move of each block (`moves`) or the move at its first sample (`inputs`).
+        mv: MVs of the Hu samples, row 0 after the move applied now.
+        cv: predicted CVs at j = 1..Hp.
+        eps_high, eps_low: largest violation of each CV limit over the penalised samples.
+        nodes: relaxations solved in the search.
+        solve_time_s: wall time of the solve [s].
+        finished_by: which path closed the problem, None if none did.
+    """
+
+    status: str
+    objective: float | None
+    bound: float | None
+    gap: float | None
+    moves: Float[np.ndarray, "block mv"] | None
+    mv: Float[np.ndarray, "sample mv"] | None
+    cv: Float[np.ndarray, "horizon cv"] | None
+    eps_high: Float[np.ndarray, " cv"] | None
+    eps_low: Float[np.ndarray, " cv"] | None
+    nodes: int
+    solve_time_s: float
+    finished_by: str | None
+
+
+@functools.partial(eqx.filter_jit)
+def _make_instance(structure, tuning, qp, free_response, setpoint, mv_now, last_move, past_moves, recover):
+    return make_instance(
+        structure,
+        tuning,
+        qp,
+        free_response=free_response,
+        setpoint=setpoint,
+        mv_now=mv_now,
+        last_move=last_move,
+        past_moves=past_moves,
+        recover=recover,
+    )
+
+
+_condense = eqx.filter_jit(condense)
+
+
+class Planner:
+    """Solves the steps of one controller.
+
+    Args:
+        structure: static configuration.
+        tuning: weights and limits.
+        model: step-response model with the same names and sampling interval.
+    """
+
+    def __init__(self, structure: Structure, tuning: Tuning, model: StepResponseModel):
+        check_match(structure, model)
+        self.structure, self.tuning, self.model = structure, tuning, model
+        self.matrix = np.asarray(dynamic_matrix(structure, model.coefficients))
+        self._constants: dict[int, Constants] = {}
+        limits = np.concatenate([np.asarray(tuning.cv_low), np.asarray(tuning.cv_high)])
+        self.has_limits = bool(np.isfinite(limits).any() and (np.asarray(tuning.slack_weight) > 0).any())
+
+    def constants(self, envelope: int) -> Constants:
+        """Constants for integer ranges of so many steps, made when first needed."""
+        if envelope not in self._constants:
+            qp = _condense(
+                self.structure, self.tuning, self.model.coefficients, envelope=envelope, has_limits=self.has_limits
+            )
+            self._constants[envelope] = Constants(self.structure, qp)
+        return self._constants[envelope]
+
+    def solve(
+        self,
+        *,
+        mv_now,
+        last_move,
+        free_response,
+        setpoint,
+        previous_moves=None,
+        past_moves=None,
+        recover: bool = False,
+        time_limit: float | None = None,
+        gap: float = 1e-6,
+        finish: str = "auto",
+    ) -> Plan:
+        """Solve one step; arguments as in `solve_plan`.
+
+        Args:
+            mv_now: MVs before the move.
+            last_move: previous move.
+            free_response: Lambda, ``"horizon cv"``.
+            setpoint: r, ``"horizon cv"``.
+            previous_moves: start, ``"block mv"``, or None.
+            past_moves: moves of the mean-move window, ``"window mv"`` oldest first, or None.
+            recover: let MVs outside their limits return the shortest way.
+            time_limit: seconds, None for none.
+            gap: relative gap.
+            finish: one of `integer.FINISHES`.
+        """
+        begin = time.perf_counter()
+        if finish not in FINISHES:
+            raise InputError("finish", finish, f"one of {', '.join(FINISHES)}")
+        as_array = lambda v: np.asarray(v, dtype=np.float64)  # noqa: E731
+        free_response, setpoint, mv_now = as_array(free_response), as_array(setpoint), as_array(mv_now)
+        past = None if past_moves is None else as_array(past_moves)
+
+        def instance_of(constants: Constants) -> QpInstance:
+            return _make_instance(
+                self.structure, self.tuning, constants.qp, free_response, setpoint, mv_now, as_array(last_move), past, recover
+            )
+
+        constants = self.constants(1)
+        instance = instance_of(constants)
+        integer = constants.integer
+        if len(integer):
+            instance = self._bounded(instance)
+            widest = np.abs(np.concatenate([np.asarray(instance.lower)[integer], np.asarray(instance.upper)[integer]]))
+            envelope = int(widest.max())
+            if envelope > 1:
+                constants = self.constants(envelope if envelope <= WIDEST_ENVELOPE else 0)
+                bounded = instance
+                instance = instance_of(constants)
+                instance = eqx.tree_at(lambda i: (i.lower, i.upper), instance, (bounded.lower, bounded.upper))
+        starts = []
+        if previous_moves is not None and len(integer):
+            scale = np.asarray(constants.qp.scale).reshape(self.structure.mv_count, -1).T
+            wanted = (as_array(previous_moves) / scale).T.reshape(-1)[integer]
+            starts.append(np.clip(np.nan_to_num(wanted), -1e6, 1e6))
+        result = (
+            solve_integer(constants, instance, starts=starts, gap=gap, time_limit=time_limit, finish=finish)
+            if len(integer)
+            else self._solve_relaxed(constants, instance, gap)
+        )
+        return self._plan(constants, instance, result, mv_now, free_response, setpoint, gap, begin)
+
+    def _solve_relaxed(self, constants: Constants, instance: QpInstance, gap: float) -> SearchResult:
+        """The problem without integers: one relaxation."""
+        if not continuous_feasible(self.structure, instance):
+            return SearchResult(None, np.inf, np.inf, codes.INFEASIBLE, None, 0)
+        search = Search(constants, instance, gap, None)
+        empty = np.zeros((1, 0), dtype=int)
+        root = search.relax(empty, empty)
+        if not np.isfinite(root.x[0]).all():
+            return SearchResult(None, np.inf, -np.inf, codes.FAILED, None, 1)
+        search.value, search.x = float(root.objective[0]), root.x[0]
+        search.nodes = 1
+        return search.finish("relaxation", float(root.bound[0]))
+
+    def _bounded(self, instance: QpInstance) -> QpInstance:
+        """Finite limits for integer moves that have none: the level set of a rounded plan (see `levelset`)."""
+        lower, upper = np.array(instance.lower), np.array(instance.upper)
+        integer = integer_columns(self.structure)
+        if np.isfinite(lower[integer]).all() and np.isfinite(upper[integer]).all():
+            return instance
+        constants = self.constants(0)
+        search = Search(constants, _padded(instance, constants), 1e-6, None)
+        root = search.relax(lower[integer][None], upper[integer][None])
+        whole_low = np.where(np.isfinite(lower[integer]), lower[integer], -1e6).astype(int)
+        whole_high = np.where(np.isfinite(upper[integer]), upper[integer], 1e6).astype(int)
+        start = np.clip(np.round(root.x[0, integer]).astype(int), whole_low, whole_high)
+        search.evaluate(start[None])
+        reach = np.sqrt(2.0 * max(search.value - float(root.bound[0]), 0.0) * constants.radius) + 1.0
+        if not np.isfinite(reach).all():
+            raise InputError(
+                "tuning.move_low",
+                "infinite",
+                "a finite move or MV limit for every integer MV that has neither weight nor effect",
+            )
+        center = root.x[0, integer]
+        lower[integer] = np.maximum(lower[integer], np.ceil(center - reach))
+        upper[integer] = np.minimum(upper[integer], np.floor(center + reach))
+        return eqx.tree_at(lambda i: (i.lower, i.upper), instance, (jnp.asarray(lower), jnp.asarray(upper)))
+
+    def _plan(self, constants, instance, result: SearchResult, mv_now, free_response, setpoint, gap, begin) -> Plan:
+        elapsed = lambda: time.perf_counter() - begin  # noqa: E731
+        if result.x is None:
+            name = codes.STATUS[result.status]
+            return Plan(name, None, None, None, None, None, None, None, None, result.nodes, elapsed(), None)
+        x = np.array(result.x)
+        integer = constants.integer
+        x[integer] = np.round(x[integer])
+        x = _repair(self.structure, instance, x)
+        moves = (x * np.asarray(constants.qp.scale)).reshape(self.structure.mv_count, -1).T
+        objective, cv, eps = self.objective(moves, free_response, setpoint)
+        bound = min(result.bound, objective)
+        reference = max(abs(objective), 1e-6 * constants.scale)
+        relative = max(objective - bound, 0.0) / reference
+        state = result.status
+        if state == codes.OPTIMAL and relative > max(gap, 1e-9):
+            state = codes.LIMIT
+        return Plan(
+            status=codes.STATUS[state],
+            objective=objective,
+            bound=bound,
+            gap=relative,
+            moves=moves,
+            mv=mv_now + np.cumsum(sample_moves(self.structure) @ moves, axis=0),
+            cv=cv,
+            eps_high=eps[0],
+            eps_low=eps[1],
+            nodes=result.nodes,
+            solve_time_s=elapsed(),
+            finished_by=result.finished_by if state == codes.OPTIMAL else None,
+        )
+
+    def objective(self, moves, free_response, setpoint) -> tuple[float, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """(6.6) of a plan in engineering units, with its predictions and limit violations.
+
+        Args:
+            moves: ``"block mv"`` [MV unit].
+            free_response: Lambda, ``"horizon cv"``.
+            setpoint: r, ``"horizon cv"``.
+
+        Returns:
+            ``(objective, cv, (eps_high, eps_low))``.
+        """
+        tuning = self.tuning
+        cv = free_response + np.einsum("cjmb,bm->jc", self.matrix, moves)
+        first = self.structure.first_penalised - 1
+        y, deviation = cv[first:], cv[first:] - setpoint[first:]
+        beyond = np.maximum(np.abs(deviation) - np.asarray(tuning.deadzone), 0.0)
+        eps_high = np.maximum((y - np.asarray(tuning.cv_high)).max(axis=0), 0.0)
+        eps_low = np.maximum((np.asarray(tuning.cv_low) - y).max(axis=0), 0.0)
+        counts = moves_per_block(self.structure)[:, None]
+        value = (
+            (np.asarray(tuning.cv_weight) * deviation**2).sum()
+            + (np.asarray(tuning.move_weight) * counts * moves**2).sum()
+            + (np.asarray(tuning.soft_quadratic) * beyond**2 + np.asarray(tuning.soft_linear) * beyond).sum()
+            + (np.asarray(tuning.slack_weight) * (eps_high + eps_low)).sum()
+        )
+        return float(value), cv, (eps_high, eps_low)
+
+
+def _padded(instance: QpInstance, constants: Constants) -> QpInstance:
+    """The instance with as many envelope rows as the constants have."""
+    rows = constants.qp.theta.shape[0]
+    predictions = instance.limit_high.shape[0]
+    offset = jnp.concatenate([instance.offset[:predictions], jnp.zeros(rows - predictions)])
+    return eqx.tree_at(lambda i: i.offset, instance, offset)
+
+
+def _repair(structure: Structure, instance: QpInstance, x: np.ndarray) -> np.ndarray:
+    """Take solver tolerance out of the continuous moves: clip moves, then positions, block after block."""
+    x = x.copy()
+    lower, upper = np.asarray(instance.lower), np.asarray(instance.upper)
+    row_low, row_high = np.asarray(instance.row_low), np.asarray(instance.row_high)
+    counts, blocks = moves_per_block(structure), structure.block_count
+    row = 0
+    from jaxmpc.blocking import oscillation_rows, window_rows
+
+    for mv in range(structure.mv_count):
+        columns = slice(mv * blocks, (mv + 1) * blocks)
+        if mv not in structure.integer_mvs:
+            position, own = 0.0, x[columns]
+            for b in range(blocks):
+                low = max(lower[columns][b], (row_low[row + b] - position) / counts[b])
+                high = min(upper[columns][b], (row_high[row + b] - position) / counts[b])
+                own[b] = min(max(own[b], low), high) if low <= high else own[b]
+                position += counts[b] * own[b]
+        row += blocks + (len(oscillation_rows(structure)) if mv in structure.integer_mvs else 0)
+        row += len(window_rows(structure))
+    return x
+
+
+def check_match(structure: Structure, model: StepResponseModel) -> None:
+    """Refuse a model whose names or sampling interval differ from the structure's."""
+    for key, ours, theirs in (
+        ("cv", structure.cv_names, model.cv_names),
+        ("mv", structure.mv_names, model.mv_names),
+    ):
+        if ours != theirs:
+            raise InputError(f"model.{key}", list(theirs), f"the structure's names in its order, {list(ours)}")
+    if abs(structure.dt - model.dt) > 1e-9 * structure.dt:
+        raise InputError("model.dt", model.dt, f"the structure's sampling interval {structure.dt} s")
+
+
+def check_vector(path: str, value, names: tuple[str, ...], unit: str) -> np.ndarray:
+    """A finite vector with one entry per name, or an `InputError`."""
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape != (len(names),) or not np.isfinite(array).all():
+        raise InputError(path, np.asarray(value).tolist(), f"{len(names)} finite numbers [{unit}] for {', '.join(names)}")
+    return array
+
+
+def solve_plan(
+    model: StepResponseModel,
+    structure: Structure,
+    tuning: Tuning,
+    *,
+    mv_now,
+    last_move,
+    free_response,
+    setpoint,
+    previous_moves=None,
+    time_limit: float | None = None,
+    gap: float = 1e-6,
+    finish: str = "auto",
+) -> Plan:
+    """Solve one controller step.
+
+    Args:
+        model: step-response model.
+        structure: static configuration.
+        tuning: weights and limits.
+        mv_now: MVs before the move, ``"mv"`` [MV unit], within their limits.
+        last_move: previous move, ``"mv"`` [MV unit]; oscillation rows use it rounded to whole steps.
+        free_response: Lambda at j = 1..Hp with bias, ``"horizon cv"`` [CV unit].
+        setpoint: r at j = 1..Hp, ``"horizon cv"`` [CV unit].
+        previous_moves: moves to start from, ``"block mv"``; may be infeasible, never changes the answer.
+        time_limit: seconds after which the best plan so far is returned with its true gap; None for none.
+        gap: relative gap at which the plan counts as optimal.
+        finish: ``auto``, ``enumeration``, ``highs`` or ``branch-and-bound``.
+
+    Returns:
+        `Plan`.
+
+    Raises:
+        InputError: naming the field, for wrong shapes, NaN or an MV outside its limits.
+    """
+    now = check_vector("mv_now", mv_now, structure.mv_names, "MV unit")
+    check_vector("last_move", last_move, structure.mv_names, "MV unit")
+    for path, value in (("free_response", free_response), ("setpoint", setpoint)):
+        array = np.asarray(value, dtype=np.float64)
+        expected = (structure.prediction_horizon, structure.cv_count)
+        if array.shape != expected or not np.isfinite(array).all():
+            raise InputError(path, f"shape {list(array.shape)}", f"finite numbers of shape {list(expected)} [CV unit]")
+    low, high = np.asarray(tuning.mv_low), np.asarray(tuning.mv_high)
+    for i, name in enumerate(structure.mv_names):
+        drift = DRIFT * (structure.integer_step[i] or max(1.0, abs(now[i])))
+        if not low[i] - drift <= now[i] <= high[i] + drift:
+            raise InputError(f"mv_now[{i}]", now[i], f"between {low[i]} and {high[i]} [MV unit] for {name}")
+    if previous_moves is not None and np.shape(previous_moves) != (structure.block_count, structure.mv_count):
+        raise InputError(
+            "previous_moves",
+            f"shape {list(np.shape(previous_moves))}",
+            f"shape {[structure.block_count, structure.mv_count]}, block by MV",
+        )
+    return Planner(structure, tuning, model).solve(
+        mv_now=now,
+        last_move=last_move,
+        free_response=free_response,
+        setpoint=setpoint,
+        previous_moves=previous_moves,
+        time_limit=time_limit,
+        gap=gap,
+        finish=finish,
+    )

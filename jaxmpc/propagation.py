@@ -1,0 +1,177 @@
+"""Hard limits on whole moves: which integers a search may still choose (thesis 6.1, 6.5).
+
+The rows of different MVs are independent, and those of one MV form a chain: the position after a block is the
+position before it plus the block's move, and the oscillation rows couple neighbours only. Limits therefore
+propagate along the chain, and a dynamic programme over (position, last move) decides feasibility exactly.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from jaxmpc.blocking import moves_per_block, oscillation_rows, window_rows
+from jaxmpc.structure import Structure
+
+UNBOUNDED = 10**6  # whole steps that stand for "no limit" in integer arithmetic
+
+
+@dataclasses.dataclass(frozen=True)
+class Chain:
+    """The blocks of one integer MV.
+
+    Attributes:
+        columns: positions of its moves in the integer vector.
+        counts: moves per block.
+        low, high: allowed position after each block, in steps from now.
+        coupled: whether the move of block b and of b - 1 may differ by one step at most (first entry unused).
+        windows, window_low, window_high: rows of the predictive mean-move limit; checked, not propagated.
+    """
+
+    columns: Int[np.ndarray, " block"]
+    counts: Int[np.ndarray, " block"]
+    low: Int[np.ndarray, " block"]
+    high: Int[np.ndarray, " block"]
+    coupled: Bool[np.ndarray, " block"]
+    windows: np.ndarray
+    window_low: np.ndarray
+    window_high: np.ndarray
+
+
+def chains_of(structure: Structure, row_low: np.ndarray, row_high: np.ndarray) -> list[Chain]:
+    """Chains of all integer MVs from the limits of `blocking.hard_rows`."""
+    blocks, counts = structure.block_count, moves_per_block(structure)
+    pairs = oscillation_rows(structure)
+    to_block = np.argmax(pairs, axis=1) if len(pairs) else np.zeros(0, dtype=int)
+    windows = window_rows(structure)
+    chains, row = [], 0
+    for mv in range(structure.mv_count):
+        low, high = row_low[row : row + blocks], row_high[row : row + blocks]
+        row += blocks
+        if mv in structure.integer_mvs:
+            coupled = np.zeros(blocks, dtype=bool)
+            coupled[to_block] = np.isfinite(row_high[row : row + len(pairs)])
+            row += len(pairs)
+            ahead = slice(row, row + len(windows))
+            columns = len(chains) * blocks + np.arange(blocks)
+            whole = lambda v: np.clip(np.round(v), -UNBOUNDED, UNBOUNDED).astype(int)  # noqa: E731
+            chains.append(
+                Chain(
+                    columns, counts, whole(low), whole(high), coupled, windows, row_low[ahead], row_high[ahead]
+                )
+            )
+        row += len(windows)
+    return chains
+
+
+def propagate(chains: list[Chain], lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Tighten integer limits along every chain until nothing changes.
+
+    Args:
+        chains: the hard rows.
+        lower, upper: ``"batch integer"`` limits of the moves [steps].
+
+    Returns:
+        ``(lower, upper, possible)``: the tightened copies, and per lane whether no domain is empty.
+    """
+    lower, upper = lower.copy(), upper.copy()
+    for _ in range(2 * lower.shape[1]):
+        before = (lower.copy(), upper.copy())
+        for chain in chains:
+            _sweep(chain, lower, upper)
+        if np.array_equal(before[0], lower) and np.array_equal(before[1], upper):
+            break
+        if (lower > upper).any(axis=1).all():
+            break
+    return lower, upper, (lower <= upper).all(axis=1)
+
+
+def _sweep(chain: Chain, lower: np.ndarray, upper: np.ndarray) -> None:
+    """One forward and one backward pass over a chain, in place."""
+    own_low, own_high = lower[:, chain.columns], upper[:, chain.columns]
+    for b in np.flatnonzero(chain.coupled):
+        own_low[:, b] = np.maximum(own_low[:, b], own_low[:, b - 1] - 1)
+        own_high[:, b] = np.minimum(own_high[:, b], own_high[:, b - 1] + 1)
+    for b in np.flatnonzero(chain.coupled)[::-1]:
+        own_low[:, b - 1] = np.maximum(own_low[:, b - 1], own_low[:, b] - 1)
+        own_high[:, b - 1] = np.minimum(own_high[:, b - 1], own_high[:, b] + 1)
+    # reachable positions: forward from zero, cut by the limits; then backward
+    at_low = np.cumsum(own_low * chain.counts, axis=1)
+    at_high = np.cumsum(own_high * chain.counts, axis=1)
+    if (at_low >= chain.low).all() and (at_high <= chain.high).all():
+        lower[:, chain.columns], upper[:, chain.columns] = own_low, own_high
+        return
+    blocks = len(chain.counts)
+    low = np.zeros((len(lower), blocks + 1), dtype=int)
+    high = np.zeros_like(low)
+    for b in range(blocks):
+        low[:, b + 1] = np.maximum(low[:, b] + chain.counts[b] * own_low[:, b], chain.low[b])
+        high[:, b + 1] = np.minimum(high[:, b] + chain.counts[b] * own_high[:, b], chain.high[b])
+    for b in reversed(range(blocks)):
+        count = chain.counts[b]
+        own_low[:, b] = np.maximum(own_low[:, b], -((high[:, b] - low[:, b + 1]) // count))
+        own_high[:, b] = np.minimum(own_high[:, b], (high[:, b + 1] - low[:, b]) // count)
+        low[:, b] = np.maximum(low[:, b], low[:, b + 1] - count * own_high[:, b])
+        high[:, b] = np.minimum(high[:, b], high[:, b + 1] - count * own_low[:, b])
+    lower[:, chain.columns], upper[:, chain.columns] = own_low, own_high
+
+
+def satisfied(chains: list[Chain], moves: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Whether whole moves ``"batch integer"`` satisfy every hard row exactly."""
+    good = ((moves >= lower) & (moves <= upper)).all(axis=1)
+    for chain in chains:
+        own = moves[:, chain.columns]
+        position = np.cumsum(own * chain.counts, axis=1)
+        good &= ((position >= chain.low) & (position <= chain.high)).all(axis=1)
+        steps = np.abs(np.diff(own, axis=1))
+        good &= (steps[:, chain.coupled[1:]] <= 1).all(axis=1)
+        if len(chain.windows):
+            total = own @ chain.windows.T
+            good &= ((total >= chain.window_low - 1e-6) & (total <= chain.window_high + 1e-6)).all(axis=1)
+    return good
+
+
+def nearest(chains: list[Chain], wanted: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray | None:
+    """Feasible whole moves closest to `wanted` in the sum of absolute differences, or None where there are none.
+
+    Window rows are not looked at. Dynamic programming over (position, last move), exact; costs milliseconds and is called only when rounding
+    breaks a hard row.
+    """
+    result = np.zeros(len(wanted), dtype=int)
+    for chain in chains:
+        path = _nearest_in_chain(chain, wanted[chain.columns], lower[chain.columns], upper[chain.columns])
+        if path is None:
+            return None
+        result[chain.columns] = path
+    return result
+
+
+def _nearest_in_chain(chain: Chain, wanted, lower, upper) -> list[int] | None:
+    layers: list[dict] = [{(0, None): (0.0, None, None)}]
+    for b in range(len(wanted)):
+        layer: dict = {}
+        remember = b + 1 < len(wanted) and chain.coupled[b + 1]
+        for state, (cost, _, _) in layers[-1].items():
+            position, last = state
+            first, final = int(lower[b]), int(upper[b])
+            if chain.coupled[b]:
+                first, final = max(first, last - 1), min(final, last + 1)
+            count = int(chain.counts[b])
+            first = max(first, -((position - int(chain.low[b])) // count))
+            final = min(final, (int(chain.high[b]) - position) // count)
+            for move in range(first, final + 1):
+                key = (position + count * move, move if remember else None)
+                total = cost + abs(move - wanted[b])
+                if key not in layer or total < layer[key][0]:
+                    layer[key] = (total, state, move)
+        if not layer:
+            return None
+        layers.append(layer)
+    key = min(layers[-1], key=lambda k: layers[-1][k][0])
+    path = []
+    for layer in layers[:0:-1]:
+        _, key, move = layer[key]
+        path.append(move)
+    return path[::-1]

@@ -1,0 +1,124 @@
+"""What fixes the shapes of a controller: horizons, blocks, names and which MVs are integer (thesis 5.1, 6.1, 6.2).
+
+A `Structure` is static: two controllers with equal structures share one compiled program. Everything that a
+sweep varies without recompiling is in `tuning.Tuning`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Literal
+
+import numpy as np
+
+from jaxmpc.errors import InputError
+
+THESIS_BLOCKS = (1, 1, 1, 1, 2, 2, 4, 4, 8, 8, 8, 16, 16, 32, 32, 64)  # (6.3)
+
+
+@dataclasses.dataclass(frozen=True)
+class Structure:
+    """Static configuration of a controller; checked on construction.
+
+    Attributes:
+        cv_names, mv_names: names, in the order of every array.
+        dt: sampling interval [s].
+        prediction_horizon: Hp [samples]; predictions are j = 1..Hp, j = 1 being the next measurement.
+        control_horizon: Hu [samples].
+        first_penalised: Hw [samples], the first j with tracking, deadzone and CV-limit cost.
+        blocks: block lengths [samples], summing to Hu; empty means no blocking (Hu blocks of one).
+        blocking: ``moves`` (the move is constant over a block, thesis figure 25) or ``inputs`` (the MV is constant over
+            a block, thesis 6.2: it moves at block starts only).
+        integer_step: step size of every integer MV [MV unit], ``None`` for a continuous one; empty means none is integer.
+        mean_move_window: samples over which the mean move is taken (thesis 6.6: 25).
+        mean_move_mode: ``reactive`` (thesis: once the mean of the past moves exceeds the limit, no move in
+            that direction) or ``predictive`` (rows on the windowed sum inside the control horizon).
+        cv_units, mv_units: engineering units, for labels.
+    """
+
+    cv_names: tuple[str, ...]
+    mv_names: tuple[str, ...]
+    dt: float = 10.0
+    prediction_horizon: int = 250
+    control_horizon: int = 200
+    first_penalised: int = 1
+    blocks: tuple[int, ...] = THESIS_BLOCKS
+    blocking: Literal["moves", "inputs"] = "moves"
+    integer_step: tuple[float | None, ...] = ()
+    mean_move_window: int = 25
+    mean_move_mode: Literal["reactive", "predictive"] = "reactive"
+    cv_units: tuple[str, ...] = ()
+    mv_units: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        for key in ("prediction_horizon", "control_horizon", "first_penalised", "mean_move_window"):
+            value = getattr(self, key)
+            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+                raise InputError(f"structure.{key}", value, "a whole number of samples, 1 or more")
+            object.__setattr__(self, key, int(value))
+        if self.first_penalised > self.prediction_horizon:
+            raise InputError(
+                "structure.first_penalised",
+                self.first_penalised,
+                f"at most prediction_horizon = {self.prediction_horizon} samples",
+            )
+        blocks = tuple(self.blocks) or (1,) * self.control_horizon
+        if any(isinstance(b, bool) or not isinstance(b, (int, np.integer)) or b < 1 for b in blocks):
+            raise InputError("structure.blocks", list(blocks), "block lengths in whole samples, 1 or more")
+        object.__setattr__(self, "blocks", tuple(int(b) for b in blocks))
+        if sum(blocks) != self.control_horizon:
+            raise InputError(
+                "structure.blocks",
+                list(blocks),
+                f"lengths that sum to control_horizon = {self.control_horizon} samples (they sum to {sum(blocks)})",
+            )
+        if self.blocking not in ("moves", "inputs"):
+            raise InputError("structure.blocking", self.blocking, "'moves' or 'inputs'")
+        if self.mean_move_mode not in ("reactive", "predictive"):
+            raise InputError("structure.mean_move_mode", self.mean_move_mode, "'reactive' or 'predictive'")
+        if not (isinstance(self.dt, (int, float)) and math.isfinite(self.dt) and self.dt > 0):
+            raise InputError("structure.dt", self.dt, "a positive sampling interval [s]")
+        steps = tuple(self.integer_step) or (None,) * self.mv_count
+        if len(steps) != self.mv_count:
+            raise InputError("structure.integer_step", list(steps), f"{self.mv_count} entries, one per MV")
+        for name, step in zip(self.mv_names, steps, strict=True):
+            if step is not None and (
+                isinstance(step, bool)
+                or not isinstance(step, (int, float))
+                or not math.isfinite(step)
+                or step <= 0
+            ):
+                raise InputError(f"structure.integer_step.{name}", step, "a positive step [MV unit]")
+        object.__setattr__(
+            self, "integer_step", tuple(None if step is None else float(step) for step in steps)
+        )
+
+    @property
+    def cv_count(self) -> int:
+        """Number of CVs."""
+        return len(self.cv_names)
+
+    @property
+    def mv_count(self) -> int:
+        """Number of MVs."""
+        return len(self.mv_names)
+
+    @property
+    def block_count(self) -> int:
+        """Number of blocks, the moves per MV that are decided."""
+        return len(self.blocks)
+
+    @property
+    def horizon_count(self) -> int:
+        """Penalised samples per CV, Hp - Hw + 1."""
+        return self.prediction_horizon - self.first_penalised + 1
+
+    @property
+    def integer_mvs(self) -> tuple[int, ...]:
+        """Positions of the integer MVs."""
+        return tuple(i for i, step in enumerate(self.integer_step) if step is not None)
+
+    def relaxed(self) -> Structure:
+        """The same structure with every MV continuous."""
+        return dataclasses.replace(self, integer_step=())

@@ -1,0 +1,95 @@
+"""What a closed loop leaves behind: one `Trajectory` per run, plain arrays with the time axis first.
+
+`jaxmpc.closed_loop.simulate` makes it; stores, key figures and plots read it. Sample k is the interval from
+`time[k]` to `time[k + 1]`: `cv[k]` is measured at its start, `mv_demand[k]` is decided from that measurement
+and held until its end.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from jaxmpc.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Trajectory:
+    """One closed-loop run.
+
+    Attributes:
+        time: ``"sample"``, start of each sample [s].
+        setpoint: ``"sample cv"`` [CV unit].
+        cv: ``"sample cv"``, measured at `time` [CV unit].
+        mv_demand: ``"sample mv"``, demand of the controller, held from `time` [MV unit].
+        mv: ``"sample mv"``, what the actuators did with it, the step-choke logic included [MV unit].
+        move: ``"sample mv"``, demand minus previous demand [MV unit].
+        bias: ``"sample cv"``, filtered output bias v(k|k) (6.4) [CV unit].
+        bias_raw: ``"sample cv"``, measured minus predicted output (2.31b) [CV unit].
+        status: ``"sample"``, codes of `jaxmpc.status`: 0 optimal, 1 limit, 2 infeasible, 3 failed.
+        fallback: ``"sample"``, whether the MVs were held because the solve gave no plan.
+        objective: ``"sample"``, objective (6.6) of the applied plan, constants included.
+        bound: ``"sample"``, proven lower bound of the objective.
+        gap: ``"sample"``, relative gap between the two.
+        nodes: ``"sample"``, relaxations solved in a search.
+        solve_time: ``"sample"`` [s].
+        finished_by: ``"sample"``, codes of `jaxmpc.status.FINISHERS`.
+        cv_names, mv_names, cv_units, mv_units: names and units in the order of the arrays.
+        dt: sampling interval [s].
+    """
+
+    time: np.ndarray
+    setpoint: np.ndarray
+    cv: np.ndarray
+    mv_demand: np.ndarray
+    mv: np.ndarray
+    move: np.ndarray
+    bias: np.ndarray
+    bias_raw: np.ndarray
+    status: np.ndarray
+    fallback: np.ndarray
+    objective: np.ndarray
+    bound: np.ndarray
+    gap: np.ndarray
+    nodes: np.ndarray
+    solve_time: np.ndarray
+    finished_by: np.ndarray
+    cv_names: tuple[str, ...]
+    mv_names: tuple[str, ...]
+    cv_units: tuple[str, ...]
+    mv_units: tuple[str, ...]
+    dt: float
+
+    def __post_init__(self):
+        samples = np.shape(self.time)[0] if np.ndim(self.time) == 1 else -1
+        for axis, keys in AXES.items():
+            size = {"": (), "cv": (len(self.cv_names),), "mv": (len(self.mv_names),)}[axis]
+            for key in keys:
+                shape = np.shape(getattr(self, key))
+                if shape != (samples, *size):
+                    raise InputError(
+                        f"trajectory.{key}", f"shape {list(shape)}", f"shape {[max(samples, 0), *size]}"
+                    )
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return len(self.time)
+
+
+AXES = {
+    "": (
+        "time",
+        "status",
+        "fallback",
+        "objective",
+        "bound",
+        "gap",
+        "nodes",
+        "solve_time",
+        "finished_by",
+    ),
+    "cv": ("setpoint", "cv", "bias", "bias_raw"),
+    "mv": ("mv_demand", "mv", "move"),
+}

@@ -1,0 +1,1 @@
+"""Studies: definitions, runner, results store, key figures and reports."""

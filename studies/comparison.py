@@ -1,0 +1,254 @@
+"""Runs several controllers over one reference on one plant and stores each run as soon as it is done.
+
+`run_comparison` is given everything that numbers depend on and asks the store which runs are missing, so a
+second call computes only what changed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import xarray as xr
+from tqdm import tqdm
+
+from jaxmpc.errors import InputError
+from jaxmpc.step_response import StepResponseModel
+from jaxmpc.trajectory import Trajectory
+from studies.definition import ComparisonDefinition, ControllerDefinition
+from studies.fingerprint import content_hash, source_hash, versions
+from studies.store import ResultStore, results_template
+
+Say = Callable[[str], None]
+TUNING_AXES = {
+    "cv": ("cv_weight", "soft_quadratic", "soft_linear", "deadzone", "cv_low", "cv_high", "slack_weight"),
+    "mv": (
+        "move_weight",
+        "mv_low",
+        "mv_high",
+        "move_low",
+        "move_high",
+        "mean_move_limit",
+        "oscillation_rows",
+    ),
+    "": ("bias_cutoff",),
+}
+
+
+def run_comparison(
+    definition: ComparisonDefinition,
+    folder: Path,
+    *,
+    model: StepResponseModel,
+    make_plant: Callable[[str], Any],
+    plant_facts: dict[str, Any],
+    extra: Callable[[], dict[str, xr.DataArray]],
+    progress: bool = True,
+    say: Say = print,
+) -> Path:
+    """Run what is missing of a comparison.
+
+    Args:
+        definition: checked with `ComparisonDefinition.check`.
+        folder: of the study, writable and locked by the caller.
+        model: prediction model of every controller.
+        make_plant: the plant with a given actuator, in its initial state.
+        plant_facts: JSON-like; identifies the plant, part of every hash.
+        extra: computes further variables of the results (sweep, steady-state map); called for a new store.
+        progress: whether to show a bar with rate and time left.
+        say: receives one line per event.
+
+    Returns:
+        The folder.
+    """
+    code = {package: source_hash(package) for package in ("jaxmpc", "identify")}
+    inputs = {
+        "plant": plant_facts,
+        "reference": msgspec.to_builtins(definition.reference),
+        "model": np.asarray(model.coefficients),
+        "model_dt": model.dt,
+        "code": code,
+    }
+    hashes = [content_hash(inputs, controller.resolved()) for controller in definition.controllers]
+    study_hash = content_hash(msgspec.to_builtins(definition), hashes)
+    store = ResultStore.begin(
+        folder,
+        [controller.name for controller in definition.controllers],
+        study_hash,
+        lambda: comparison_template(definition, model, extra(), hashes, study_hash, plant_facts, code),
+        say,
+    )
+    for controller in definition.controllers:
+        if store.complete(controller.name):
+            say(f"{controller.label}: stored already.")
+            continue
+        started = time.perf_counter()
+        trajectory = run_controller(controller, definition, model, make_plant, progress)
+        wall_time = time.perf_counter() - started
+        store.write(controller.name, trajectory, wall_time)
+        say(f"{controller.label}: {trajectory.samples} samples in {wall_time:.1f} s.")
+    return folder
+
+
+def run_controller(
+    definition: ControllerDefinition,
+    comparison: ComparisonDefinition,
+    model: StepResponseModel,
+    make_plant: Callable[[str], Any],
+    progress: bool = True,
+) -> Trajectory:
+    """One closed loop of a comparison.
+
+    Args:
+        definition: of the controller.
+        comparison: gives the reference.
+        model: prediction model.
+        make_plant: the plant with a given actuator.
+        progress: whether to show a bar with rate and time left.
+    """
+    from jaxmpc.closed_loop import simulate
+    from jaxmpc.controller import ContinuousController, MixedIntegerController
+
+    kind = MixedIntegerController if definition.kind == "mixed-integer" else ContinuousController
+    controller = kind(definition.structure(), definition.build_tuning(), model)
+    plant = make_plant(definition.actuator)
+    with _bar(definition.label, progress) as report, _closing(plant):
+        return simulate(controller, plant, comparison.reference.build(), progress=report)
+
+
+@contextlib.contextmanager
+def _bar(label: str, show: bool) -> Iterator[Callable[[int, int], None]]:
+    """A progress callback ``(done, total)`` that shows samples, rate and time left."""
+    with tqdm(desc=label, unit="sample", disable=not show, dynamic_ncols=True, mininterval=0.5) as bar:
+
+        def report(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield report
+
+
+@contextlib.contextmanager
+def _closing(plant: Any) -> Iterator[None]:
+    """Free what the plant holds outside Python, if it holds anything."""
+    try:
+        yield
+    finally:
+        close = getattr(plant, "close", None)
+        if close is not None:
+            close()
+
+
+def comparison_template(
+    definition: ComparisonDefinition,
+    model: StepResponseModel,
+    extra: dict[str, xr.DataArray],
+    hashes: list[str],
+    study_hash: str,
+    plant_facts: dict[str, Any],
+    code: dict[str, str],
+) -> xr.Dataset:
+    """The results of a comparison before anything has run: setpoints, tuning, model and provenance.
+
+    Args:
+        definition: of the study.
+        model: prediction model.
+        extra: further variables.
+        hashes: content hash of every controller's inputs.
+        study_hash: of everything.
+        plant_facts: identifies the plant.
+        code: hash of every package that computes results.
+    """
+    first = definition.controllers[0].structure()
+    reference = definition.reference.build()
+    if model.cv_names != first.cv_names or model.mv_names != first.mv_names:
+        raise InputError(
+            "model.cv, model.mv",
+            [*model.cv_names, *model.mv_names],
+            f"the names {[*first.cv_names, *first.mv_names]} of the controllers",
+        )
+    if abs(model.dt - first.dt) > 1e-9:
+        raise InputError("model.dt", model.dt, f"the sampling interval of the controllers, {first.dt} s")
+    window = reference.window(first.dt)
+    shared = {
+        "setpoint": xr.DataArray(
+            reference.sample(first.dt),
+            dims=("time", "cv"),
+            attrs={"long_name": "setpoint", "units": "cv_unit"},
+        ),
+        "window": xr.DataArray(
+            window.astype("i4"),
+            dims="time",
+            attrs={"long_name": "index of the setpoint window", "units": "1"},
+        ),
+        "model_coefficient": xr.DataArray(
+            np.asarray(model.coefficients),
+            dims=("cv", "mv", "lag"),
+            coords={
+                "lag": (
+                    "lag",
+                    first.dt * np.arange(1, model.samples + 1),
+                    {"long_name": "time after the step", "units": "s"},
+                )
+            },
+            attrs={"long_name": "step-response coefficient", "units": "cv_unit per mv_unit"},
+        ),
+        **_controller_variables(definition),
+        **extra,
+    }
+    provenance = {
+        "study": definition.name,
+        "title": definition.title,
+        "dt": first.dt,
+        "definition": msgspec.to_builtins(definition),
+        "plant": plant_facts,
+        "model": {"working_point": dict(model.working_point), "provenance": dict(model.provenance)},
+        "code": code,
+        "versions": versions(),
+        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
+    return results_template(
+        controllers=[controller.name for controller in definition.controllers],
+        labels=[controller.label for controller in definition.controllers],
+        hashes=hashes,
+        time=first.dt * np.arange(len(window)),
+        cv_names=first.cv_names,
+        mv_names=first.mv_names,
+        cv_units=first.cv_units,
+        mv_units=first.mv_units,
+        shared=shared,
+        provenance=provenance,
+        study_hash=study_hash,
+    )
+
+
+def _controller_variables(definition: ComparisonDefinition) -> dict[str, xr.DataArray]:
+    """Tuning and kind of every controller, as variables over ``controller``."""
+    tunings = [controller.build_tuning() for controller in definition.controllers]
+    structures = [controller.structure() for controller in definition.controllers]
+    out = {}
+    for axis, keys in TUNING_AXES.items():
+        for key in keys:
+            values = np.stack([np.asarray(getattr(tuning, key), dtype=float) for tuning in tunings])
+            out[f"tuning_{key}"] = xr.DataArray(
+                values,
+                dims=("controller", axis) if axis else ("controller",),
+                attrs={"long_name": f"tuning: {key.replace('_', ' ')}"},
+            )
+    text = np.dtypes.StringDType()
+    for key in ("kind", "actuator", "blocking", "tuning"):
+        values = [getattr(controller, key) for controller in definition.controllers]
+        name = "tuning_preset" if key == "tuning" else key
+        out[name] = xr.DataArray(np.array(values, dtype=text), dims="controller")
+    out["mean_move_window"] = xr.DataArray(
+        np.array([structure.mean_move_window for structure in structures], dtype="i4"),
+        dims="controller",
+        attrs={"long_name": "samples of the mean move", "units": "1"},
+    )
+    return out

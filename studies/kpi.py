@@ -1,0 +1,191 @@
+"""Key figures of a closed loop, as pure functions of arrays (time axis first).
+
+Everything here is `jax.numpy` on fixed shapes, so `jax.vmap` turns it into the key figures of thousands
+of scenarios; plain numpy arrays go in just as well. Notation: y measured CV, r setpoint, u actuator
+position, k the sample, dt the sampling interval, m[k] = u[k] - u[k-1] the move at sample k.
+
+A *move* is an |m[k]| above a threshold. `MOVE_THRESHOLD` = 0.05 % keeps the creeping of a continuous choke
+out and every 2 % step in. A *reversal* is a move whose direction is opposite to the move before it.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+MOVE_THRESHOLD = 0.05  # % choke
+
+
+def moves_of(position: Float[Array, " sample"], start) -> Float[Array, " sample"]:
+    """m[0] = u[0] - start, m[k] = u[k] - u[k-1]; `start` is the position before the run, same unit."""
+    return jnp.diff(jnp.asarray(position), prepend=jnp.asarray(start)[None])
+
+
+def travel(move: Float[Array, " sample"]) -> Float[Array, ""]:
+    """Travel sum_k |m[k]|, in the unit of the move: the wear of a choke, in %."""
+    return jnp.abs(jnp.asarray(move)).sum()
+
+
+def move_count(move: Float[Array, " sample"], threshold: float = MOVE_THRESHOLD) -> Int[Array, ""]:
+    """Number of samples with |m[k]| > threshold."""
+    return (jnp.abs(jnp.asarray(move)) > threshold).sum()
+
+
+def reversal_events(
+    move: Float[Array, " sample"],
+    threshold: float = MOVE_THRESHOLD,
+    segment: Int[Array, " sample"] | None = None,
+) -> Bool[Array, " sample"]:
+    """Samples at which the MV turns round.
+
+    Args:
+        move: m.
+        threshold: smallest |m| that counts as a move, same unit.
+        segment: a label per sample; only moves with the same label, 0 or more, are compared. Without it, all.
+
+    Returns:
+        ``"sample"``: |m[k]| > threshold and sign m[k] = -sign m[j], where j < k is the move before it and
+        segment[j] = segment[k] >= 0.
+    """
+    move = jnp.asarray(move)
+    moved = jnp.abs(move) > threshold
+    index = jnp.arange(move.shape[0])
+    latest = jax.lax.cummax(jnp.where(moved, index, -1))  # the latest move at or before each sample
+    before = jnp.concatenate([jnp.full((1,), -1, latest.dtype), latest[:-1]])
+    turned = moved & (before >= 0) & (jnp.sign(move) * jnp.sign(move[before]) < 0)
+    if segment is None:
+        return turned
+    segment = jnp.asarray(segment)
+    return turned & (segment >= 0) & (segment[before] == segment)
+
+
+def count_by_segment(
+    event: Bool[Array, " sample"], segment: Int[Array, " sample"], segments: int
+) -> Int[Array, " segment"]:
+    """Number of events with each label 0..segments-1; labels below 0 are left out."""
+    label = jnp.arange(segments)[:, None]
+    return ((jnp.asarray(segment)[None, :] == label) & jnp.asarray(event)[None, :]).sum(axis=1)
+
+
+def second_halves(window: Int[np.ndarray, " sample"]) -> Int[np.ndarray, " sample"]:
+    """The window index in the second half of every window (from sample n // 2 of n), -1 elsewhere.
+
+    What happens right after a setpoint change is a transient; what is left in the second half is hunting.
+    """
+    window = np.asarray(window)
+    out = np.full(window.shape, -1)
+    for w in np.unique(window):
+        samples = np.flatnonzero(window == w)
+        out[samples[len(samples) // 2 :]] = w
+    return out
+
+
+def dwell(
+    move: Float[Array, " sample"], dt: float, threshold: float = MOVE_THRESHOLD
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Mean and shortest time between successive moves [s].
+
+    With moves at k1 < ... < kn: mean (kn - k1) dt / (n - 1), shortest min_i (k(i+1) - k(i)) dt; NaN if n < 2.
+    """
+    moved = jnp.abs(jnp.asarray(move)) > threshold
+    index = jnp.arange(moved.shape[0])
+    latest = jax.lax.cummax(jnp.where(moved, index, -1))
+    before = jnp.concatenate([jnp.full((1,), -1, latest.dtype), latest[:-1]])
+    follows = moved & (before >= 0)
+    distance = jnp.where(follows, (index - before) * dt, 0.0)
+    count = follows.sum()
+    mean = jnp.where(count > 0, distance.sum() / jnp.maximum(count, 1), jnp.nan)
+    shortest = jnp.where(follows, distance, jnp.inf).min()
+    return mean, jnp.where(count > 0, shortest, jnp.nan)
+
+
+def mean_absolute_deviation(
+    cv: Float[Array, "sample cv"], setpoint: Float[Array, "sample cv"]
+) -> Float[Array, " cv"]:
+    """mean_k |y[k] - r[k]| [CV unit]."""
+    return jnp.abs(jnp.asarray(cv) - jnp.asarray(setpoint)).mean(axis=0)
+
+
+def integral_absolute_error(
+    cv: Float[Array, "sample cv"], setpoint: Float[Array, "sample cv"], dt: float
+) -> Float[Array, " cv"]:
+    """IAE = dt sum_k |y[k] - r[k]| [CV unit s]."""
+    return dt * jnp.abs(jnp.asarray(cv) - jnp.asarray(setpoint)).sum(axis=0)
+
+
+def time_outside_deadzone(
+    cv: Float[Array, "sample cv"],
+    setpoint: Float[Array, "sample cv"],
+    deadzone: Float[Array, " cv"],
+    dt: float,
+) -> Float[Array, " cv"]:
+    """Time with |y[k] - r[k]| > c [s], c the half width of the deadzone: dt times the number of samples."""
+    outside = jnp.abs(jnp.asarray(cv) - jnp.asarray(setpoint)) > jnp.asarray(deadzone)
+    return dt * outside.sum(axis=0)
+
+
+def limit_excess(
+    value: Float[Array, "sample channel"], low: Float[Array, " channel"], high: Float[Array, " channel"]
+) -> Float[Array, "sample channel"]:
+    """How far a value is outside its limits, max(low - v, v - high, 0), same unit."""
+    value = jnp.asarray(value)
+    return jnp.maximum(jnp.maximum(jnp.asarray(low) - value, value - jnp.asarray(high)), 0.0)
+
+
+def limit_violations(
+    value: Float[Array, "sample channel"],
+    low: Float[Array, " channel"],
+    high: Float[Array, " channel"],
+    tolerance: Float[Array, " channel"] | float = 0.0,
+) -> Int[Array, " channel"]:
+    """Number of samples that are outside their limits by more than `tolerance` (rounding), same unit."""
+    return (limit_excess(value, low, high) > jnp.asarray(tolerance)).sum(axis=0)
+
+
+def windowed_mean(move: Float[Array, " sample"], samples: int) -> Float[Array, " sample"]:
+    """Mean of the last n = `samples` moves up to and including k (6.6); moves before the run are zero."""
+    total = jnp.cumsum(jnp.asarray(move))
+    earlier = jnp.concatenate([jnp.zeros(samples, total.dtype), total])[: total.shape[0]]
+    return (total - earlier) / samples
+
+
+def mean_move_stops(
+    move: Float[Array, " sample"], samples: int, limit: float, threshold: float = MOVE_THRESHOLD
+) -> Int[Array, ""]:
+    """Steps of the staircase: how often opening pauses because the windowed mean is above its limit.
+
+    Counts opening moves m[k] > threshold whose opening move before it, at j < k - 1, brought the windowed
+    mean above `limit`, with no closing move in between: opening went on after a pause.
+    """
+    move = jnp.asarray(move)
+    mean = windowed_mean(move, samples)
+    opening = move > threshold
+    index = jnp.arange(move.shape[0])
+    last_opening = jax.lax.cummax(jnp.where(opening, index, -1))
+    before = jnp.concatenate([jnp.full((1,), -1, last_opening.dtype), last_opening[:-1]])
+    last_closing = jax.lax.cummax(jnp.where(move < -threshold, index, -1))
+    follows = opening & (before >= 0) & (index - before > 1) & (last_closing < before)
+    return (follows & (mean[before] > limit)).sum()
+
+
+def opening_above_limit(move: Float[Array, " sample"], samples: int, limit: float) -> Int[Array, ""]:
+    """Opening moves made although the mean of the `samples` moves before them was above `limit` (6.6).
+
+    Both comparisons allow 1e-6 for rounding, in the unit of the move.
+    """
+    move = jnp.asarray(move)
+    before = jnp.concatenate([jnp.zeros(1, move.dtype), windowed_mean(move, samples)[:-1]])
+    return ((before > limit + 1e-6) & (move > 1e-6)).sum()
+
+
+def solve_time_statistics(solve_time: Float[Array, " sample"]) -> Float[Array, " statistic"]:
+    """Median, 99th percentile (linear interpolation) and largest solve time [s]."""
+    return jnp.percentile(jnp.asarray(solve_time), jnp.array([50.0, 99.0, 100.0]))
+
+
+def largest_gap(gap: Float[Array, " sample"]) -> Float[Array, ""]:
+    """Largest relative gap between objective and bound; infinite if a sample has none (NaN)."""
+    gap = jnp.asarray(gap)
+    return jnp.where(jnp.isnan(gap), jnp.inf, gap).max()

@@ -1,0 +1,321 @@
+"""The results of a study: one Zarr (v3) store per study, read as an `xarray.Dataset` with names and units.
+
+Layout: every trajectory variable has the axes ``controller, time`` and, where it has one, ``cv`` or ``mv``;
+one controller is one Zarr chunk and the only unit that is written. A controller's data land first and its
+``complete`` flag last, so a run that is killed leaves nothing that looks finished. The store itself appears
+in one rename. A store that answers another question (another ``study_hash``) is set aside under its own name,
+never overwritten, and what it holds for an unchanged controller is taken over.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from jaxmpc.errors import InputError
+from jaxmpc.trajectory import Trajectory
+
+RESULTS = "results.zarr"
+FORMAT = "jaxmpc/results/1"
+_UNFINISHED = ".new-results-"
+
+# variable: (field of Trajectory, channel axis, type, value before it is computed, long name, unit)
+VARIABLES: dict[str, tuple[str, str | None, str, Any, str, str]] = {
+    "measurement": ("cv", "cv", "f8", np.nan, "measured CV at the start of the sample", "cv_unit"),
+    "demand": ("mv_demand", "mv", "f8", np.nan, "MV demanded by the controller", "mv_unit"),
+    "position": ("mv", "mv", "f8", np.nan, "MV after the actuator", "mv_unit"),
+    "move": ("move", "mv", "f8", np.nan, "move of the demand", "mv_unit"),
+    "bias": ("bias", "cv", "f8", np.nan, "filtered output bias v(k|k)", "cv_unit"),
+    "bias_raw": ("bias_raw", "cv", "f8", np.nan, "measured minus predicted CV", "cv_unit"),
+    "status": ("status", None, "i1", -1, "status of the solve", "1"),
+    "fallback": ("fallback", None, "i1", -1, "MVs held because the solve gave no plan", "1"),
+    "objective": ("objective", None, "f8", np.nan, "objective (6.6) of the applied plan", "1"),
+    "bound": ("bound", None, "f8", np.nan, "proven lower bound of the objective", "1"),
+    "gap": ("gap", None, "f8", np.nan, "relative gap between objective and bound", "1"),
+    "nodes": ("nodes", None, "i4", -1, "relaxations solved in a search", "1"),
+    "solve_time": ("solve_time", None, "f8", np.nan, "time of one controller step", "s"),
+    "finished_by": ("finished_by", None, "i1", -1, "what proved the integer optimum", "1"),
+}
+
+
+def check_writable(folder: str | Path, field: str = "out") -> Path:
+    """Make a folder if it is missing and make sure that files can be written there.
+
+    Raises:
+        InputError: naming the folder and the reason.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(
+            field, str(folder), f"a folder that can be written ({error.strerror or error})"
+        ) from error
+    return folder
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold the folder for one run; a second run on it is refused.
+
+    Raises:
+        InputError: if another process holds it.
+    """
+    try:
+        import fcntl
+    except ImportError:  # no such locks on this system
+        yield
+        return
+    with open(folder / ".lock", "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise InputError(
+                "out",
+                str(folder),
+                "a folder that no other run is writing",
+                "Wait for that run, or choose another folder",
+            ) from None
+        yield
+
+
+def results_template(
+    *,
+    controllers: list[str],
+    labels: list[str],
+    hashes: list[str],
+    time: np.ndarray,
+    cv_names: tuple[str, ...],
+    mv_names: tuple[str, ...],
+    cv_units: tuple[str, ...],
+    mv_units: tuple[str, ...],
+    shared: dict[str, xr.DataArray],
+    provenance: dict[str, Any],
+    study_hash: str,
+) -> xr.Dataset:
+    """The results of a study with everything in place but the trajectories.
+
+    Args:
+        controllers: names, the coordinate.
+        labels: for legends, one per controller.
+        hashes: content hash of each controller's inputs.
+        time: ``"sample"``, start of each sample [s].
+        cv_names: names of the CVs, the coordinate.
+        mv_names: names of the MVs, the coordinate.
+        cv_units: units of the CVs.
+        mv_units: units of the MVs.
+        shared: variables without a trajectory: setpoints, tuning, model, sweep.
+        provenance: JSON-like facts, one attribute each.
+        study_hash: hash of everything that the results depend on.
+
+    Returns:
+        A data set whose trajectory variables read "not computed" (NaN, -1) and whose ``complete`` is 0.
+    """
+    text = np.dtypes.StringDType()
+    sizes = {"cv": len(cv_names), "mv": len(mv_names)}
+    data = dict(shared)
+    for name, (_, axis, kind, empty, long_name, unit) in VARIABLES.items():
+        dims = ("controller", "time") + ((axis,) if axis else ())
+        shape = (len(controllers), len(time)) + ((sizes[axis],) if axis else ())
+        data[name] = xr.DataArray(
+            np.full(shape, empty, dtype=kind), dims=dims, attrs={"long_name": long_name, "units": unit}
+        )
+    n = len(controllers)
+    data["wall_time"] = xr.DataArray(
+        np.full(n, np.nan), dims="controller", attrs={"long_name": "time of the whole run", "units": "s"}
+    )
+    data["complete"] = xr.DataArray(
+        np.zeros(n, dtype="i1"),
+        dims="controller",
+        attrs={"long_name": "1 once every sample of the controller is stored", "units": "1"},
+    )
+    coords = {
+        "controller": ("controller", np.array(controllers, dtype=text), {"long_name": "controller"}),
+        "label": ("controller", np.array(labels, dtype=text), {"long_name": "controller and actuator"}),
+        "content_hash": (
+            "controller",
+            np.array(hashes, dtype=text),
+            {"long_name": "SHA-256 of the inputs of the run"},
+        ),
+        "time": ("time", np.asarray(time, dtype=float), {"long_name": "time", "units": "s"}),
+        "cv": ("cv", np.array(cv_names, dtype=text), {"long_name": "controlled variable"}),
+        "mv": ("mv", np.array(mv_names, dtype=text), {"long_name": "manipulated variable"}),
+        "cv_unit": ("cv", np.array(cv_units, dtype=text), {"long_name": "unit of the CV"}),
+        "mv_unit": ("mv", np.array(mv_units, dtype=text), {"long_name": "unit of the MV"}),
+    }
+    attrs = {"format": FORMAT, "study_hash": study_hash}
+    attrs |= {key: v if isinstance(v, (str, float)) else json.dumps(v) for key, v in provenance.items()}
+    return xr.Dataset(data, coords, attrs)
+
+
+class ResultStore:
+    """One study's store while it is being written; see the module for what is written when."""
+
+    def __init__(self, path: Path, controllers: list[str]):
+        """Use `begin`."""
+        self.path, self.controllers = path, controllers
+
+    @classmethod
+    def begin(
+        cls,
+        folder: Path,
+        controllers: list[str],
+        study_hash: str,
+        make_template: Callable[[], xr.Dataset],
+        say: Callable[[str], None] = print,
+    ) -> ResultStore:
+        """Open the store of a study, or make it.
+
+        Args:
+            folder: of the study; locked by the caller.
+            controllers: their names, in the order of the store.
+            study_hash: hash of everything that the results depend on.
+            make_template: gives the study's `results_template`; called only if there is no such store yet.
+            say: receives a line when an older store is set aside or its results are taken over.
+        """
+        path = folder / RESULTS
+        for remains in folder.glob(f"{_UNFINISHED}*"):  # of a run that was killed while it made its store
+            shutil.rmtree(remains, ignore_errors=True)
+        store = cls(path, controllers)
+        if path.exists() and _study_hash(path) == study_hash:
+            return store
+        template = make_template()
+        if path.exists():
+            kept = _set_aside(path)
+            say(f"The results in {path} are of another definition or code; they are kept as {kept.name}.")
+        _write_new(path, template)
+        store._take_over(template, say)
+        return store
+
+    def complete(self, controller: str) -> bool:
+        """Whether every sample of the controller is stored."""
+        with xr.open_zarr(self.path, consolidated=False, chunks=None) as data:
+            return bool(data.complete.values[self.controllers.index(controller)])
+
+    def write(self, controller: str, trajectory: Trajectory, wall_time: float) -> None:
+        """Store a finished run: data first, `complete` last.
+
+        Args:
+            controller: its name.
+            trajectory: of the length of the study.
+            wall_time: of the run [s].
+        """
+        data = {}
+        for name, (field, axis, kind, *_) in VARIABLES.items():
+            values = np.asarray(getattr(trajectory, field)).astype(kind)[None]
+            data[name] = (("controller", "time") + ((axis,) if axis else ()), values)
+        data["wall_time"] = (("controller",), np.array([wall_time]))
+        self._write_region(controller, xr.Dataset(data))
+
+    def _write_region(self, controller: str, data: xr.Dataset) -> None:
+        i = self.controllers.index(controller)
+        region = {"controller": slice(i, i + 1)}
+        data.to_zarr(self.path, region=region, consolidated=False)
+        done = xr.Dataset({"complete": (("controller",), np.ones(1, dtype="i1"))})
+        done.to_zarr(self.path, region=region, consolidated=False)
+
+    def _take_over(self, template: xr.Dataset, say: Callable[[str], None]) -> None:
+        """Copy controllers that an earlier store of this folder holds with equal content hash."""
+        wanted = dict(zip(self.controllers, template.content_hash.values.tolist(), strict=True))
+        for older in sorted(self.path.parent.glob("results-*.zarr")):
+            try:
+                with open_results(older) as data:
+                    hashes = data.content_hash.values.tolist()
+                    for name, value in list(wanted.items()):
+                        if value in hashes and bool(data.complete.values[hashes.index(value)]):
+                            row = data.isel(controller=[hashes.index(value)])
+                            fields = [*VARIABLES, "wall_time"]
+                            self._write_region(name, row[fields].load().drop_vars(list(row.coords)))
+                            del wanted[name]
+                            say(f"{name}: taken over from {older.name}.")
+            except (InputError, KeyError, ValueError, OSError) as error:
+                say(f"{older.name} cannot be read, nothing is taken over from it ({error}).")
+
+
+def open_results(path: str | Path) -> xr.Dataset:
+    """Open the results of a study, read lazily.
+
+    Args:
+        path: the folder of a study, or its ``.zarr`` store.
+
+    Returns:
+        A data set with the coordinates controller, time [s], cv and mv; JSON facts on where the numbers come
+        from in its attributes (`provenance` decodes one). Rows of controllers with ``complete`` 0 are empty.
+
+    Raises:
+        InputError: if there are no results or they cannot be read.
+    """
+    path = Path(path)
+    store = path if path.suffix == ".zarr" else path / RESULTS
+    if not store.exists():
+        raise InputError("results", str(path), f"a study folder with {RESULTS}", "Run the study first")
+    try:
+        data = xr.open_zarr(store, consolidated=False, chunks=None)
+        # Plain strings select and print better than the stored type.
+        plain = {
+            n: (v.dims, v.values.astype(object), v.attrs)
+            for n, v in data.variables.items()
+            if v.dtype.kind in "OT"
+        }
+        data = data.assign_coords({name: plain[name] for name in plain if name in data.coords})
+        data = data.assign({name: plain[name] for name in plain if name not in data.coords})
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(
+            "results", str(store), f"a readable store ({error})", "Remove it and run the study again"
+        ) from error
+    if data.attrs.get("format") != FORMAT:
+        raise InputError("results.format", data.attrs.get("format"), FORMAT)
+    return data
+
+
+def provenance(data: xr.Dataset, key: str) -> Any:
+    """A JSON fact from the attributes of a result, decoded; `None` if it is not there."""
+    value = data.attrs.get(key)
+    try:
+        return json.loads(value) if isinstance(value, str) else value
+    except json.JSONDecodeError:
+        return value
+
+
+def _study_hash(path: Path) -> str | None:
+    try:
+        with open_results(path) as data:
+            return data.attrs.get("study_hash")
+    except InputError:
+        return None
+
+
+def _set_aside(path: Path) -> Path:
+    """Rename a store so that it keeps its content under a name that says which study it is."""
+    stem = f"results-{(_study_hash(path) or 'unreadable')[:10]}"
+    target = path.with_name(f"{stem}.zarr")
+    count = 1
+    while target.exists():
+        count += 1
+        target = path.with_name(f"{stem}-{count}.zarr")
+    os.rename(path, target)
+    return target
+
+
+def _write_new(path: Path, template: xr.Dataset) -> None:
+    """Write the store beside its place and rename it, so that it is there whole or not at all."""
+    encoding = {}
+    for name in [*VARIABLES, "wall_time", "complete"]:
+        encoding[name] = {"chunks": (1, *template[name].shape[1:])}
+    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=_UNFINISHED))
+    try:
+        template.to_zarr(temporary / RESULTS, zarr_format=3, consolidated=False, encoding=encoding)
+        os.rename(temporary / RESULTS, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
