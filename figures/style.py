@@ -10,6 +10,7 @@ import contextlib
 import io
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -43,7 +44,7 @@ VERDICT_COLOURS = {
 NAMES = {"gas_rate": "gas rate", "oil_rate": "oil rate", "choke": "choke", "gas_lift": "gas lift"}
 UNITS = {"m3/h": "m³/h"}
 
-RC = {
+RC: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9.0,
     "axes.titlesize": 10.0,
@@ -98,6 +99,7 @@ def save(drawn: Figure, out: str | Path, name: str) -> list[Path]:
     for kind, metadata in (("png", {"Software": None}), ("pdf", {"CreationDate": None, "Producer": None})):
         buffer = io.BytesIO()
         drawn.savefig(buffer, format=kind, metadata=metadata)
+        drawn.set_layout_engine("none")  # laid out once, the same in both files
         paths.append(write_atomically(Path(out) / f"{name}.{kind}", buffer.getvalue()))
     return paths
 

@@ -9,33 +9,37 @@ well, within its uncertainty. Run ``python -m identify.fit DATA.json --out WELL.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.errors import InputError
-from jaxmpc.plant import STATE_SCALE, check_inputs, rates, runge_kutta, steady_state
-from jaxmpc.plant import WellPlant, _JaxOps
+from jaxmpc.plant import STATE_SCALE, JaxOps, check_inputs, rates, runge_kutta, steady_state
 from jaxmpc.step_response import FORMAT, StepResponseModel, make_model
 from jaxmpc.well import (
     CV_NAMES,
     DEFAULT_CHOKE,
     DEFAULT_LIFT,
     MV_NAMES,
+    SHIPPED_STEADY_STATE,
     WellParameters,
+    check_parameters,
+    load_parameters,
     model,
     parameters_to_dict,
     save_parameters,
 )
 
 STEPS = (2.0, 100.0)  # choke [%] and lift [m3/h], as in the thesis
-RESPONSE_ERROR = 0.02  # standard error of a response, as a share of its peak
-RATE_ERROR = 0.01  # relative standard error of the steady rates, where the data give them
+RESPONSE_ERROR = 0.05  # standard error of a response, as a share of its peak: the model's, not the data's
+RESPONSE_COUNT = 10.0  # independent values that one response is worth
+RATE_ERROR = 0.01  # relative standard error of the steady rates at the working point
 
 # Relative uncertainty of the parameters that are fitted; the two shape coefficients are absolute.
 UNCERTAINTY = {
@@ -73,7 +77,7 @@ class StepData(NamedTuple):
         coefficients: ``"cv mv n"``, S(1)..S(n), CV change at 1..n samples after a unit step.
         dt: sampling interval [s].
         choke, lift: working point [%, m3/h].
-        rates: steady gas and oil rates at the working point [m3/h], or None if they are not known.
+        rates: steady gas and oil rates at the working point [m3/h]; None keeps them near the prior's.
     """
 
     coefficients: np.ndarray
@@ -134,12 +138,19 @@ def load_step_data(path: str | Path) -> StepData:
         largest = np.abs(coefficients).max(axis=-1)
         if (np.abs(coefficients[..., 0]) > 1e-6 * largest).any() or coefficients.shape[-1] < 2:
             raise InputError(
-                "data.coefficients", coefficients[..., 0].tolist(), "entry 0, at the instant of the step, to be 0"
+                "data.coefficients",
+                coefficients[..., 0].tolist(),
+                "entry 0, at the instant of the step, to be 0",
             )
         coefficients = coefficients[..., 1:]
-    for key, names, starts in (("cv", table.cv_names, ("gas", "oil")), ("mv", table.mv_names, ("choke", "gas"))):
+    for key, names, starts in (
+        ("cv", table.cv_names, ("gas", "oil")),
+        ("mv", table.mv_names, ("choke", "gas")),
+    ):
         if len(names) != 2 or not all(n.lower().startswith(s) for n, s in zip(names, starts, strict=True)):
-            raise InputError(f"data.{key}", list(names), f"two names that start with {starts[0]} and {starts[1]}")
+            raise InputError(
+                f"data.{key}", list(names), f"two names that start with {starts[0]} and {starts[1]}"
+            )
     choke, lift = point.get("choke", DEFAULT_CHOKE), point.get("gas_lift", DEFAULT_LIFT)
     check_inputs(choke, lift)
     check_inputs(choke + STEPS[0], lift + STEPS[1])
@@ -152,53 +163,83 @@ def load_step_data(path: str | Path) -> StepData:
     return StepData(coefficients, table.dt, float(choke), float(lift), measured)
 
 
-def _measure(x, u, parameters):
-    return jnp.stack(model(_JaxOps, tuple(x), tuple(u), parameters)[1][:2])
-
-
-def _simulate(parameters: WellParameters, x0, data: StepData):
-    """Steady rates, and step responses ``"cv mv n"``, as a differentiable function of the parameters."""
-    scale = jnp.asarray(STATE_SCALE)
-    here = jnp.array([data.choke, data.lift, 0.0])
-
-    def drift(s, parameters):
-        return rates(s * scale, here, parameters) / scale
-
-    # One Newton step from the solution gives its derivative: dx = -J^-1 df.
-    s = jax.lax.stop_gradient(x0 / scale)
-    jacobian = jax.lax.stop_gradient(jax.jacfwd(drift)(s, parameters))
-    x0 = (s - jnp.linalg.solve(jacobian, drift(s, parameters))) * scale
-    steady = _measure(x0, here, parameters)
-
-    def response(step):
-        u = here + step
-
-        def sample(x, _):
-            x = jnp.stack(runge_kutta(tuple(x), tuple(u), parameters, round(data.dt), 1.0))
-            return x, _measure(x, u, parameters)
-
-        _, cv = jax.lax.scan(sample, x0, length=data.coefficients.shape[-1])
-        return ((cv - steady) / jnp.sum(step)).T
-
-    changes = jnp.array([[STEPS[0], 0.0, 0.0], [0.0, STEPS[1], 0.0]])
-    return steady, jnp.stack([response(change) for change in changes], axis=1)
-
-
 def _unpack(theta, prior: WellParameters) -> WellParameters:
     """Parameters from the fitted vector, whose entries count uncertainties away from the prior."""
     changed = {}
     for value, (name, width) in zip(theta, UNCERTAINTY.items(), strict=True):
         centre = getattr(prior, name)
         changed[name] = centre + width * value if name in ABSOLUTE else centre * jnp.exp(width * value)
-    body = {**parameters_to_dict(prior), **changed}
-    return WellParameters(**body)
+    return dataclasses.replace(prior, **changed)
+
+
+def _measure(x, u, parameters):
+    return jnp.stack(model(JaxOps, tuple(x), tuple(u), parameters)[1][:2])
+
+
+def simulate_steps(parameters: WellParameters, x0, point, seconds: int, samples: int):
+    """Step responses as a differentiable function of the parameters.
+
+    Args:
+        parameters: of the well.
+        x0: ``"8"``, its steady state at the working point.
+        point: ``"2"``, working point: choke [%] and lift [m3/h].
+        seconds: sampling interval [s].
+        samples: number of coefficients.
+
+    Returns:
+        ``(steady, response)``: steady CVs ``"cv"`` [m3/h], and S(1)..S(samples) ``"cv mv n"``.
+    """
+    scale = jnp.asarray(STATE_SCALE)
+    here = jnp.append(point, 0.0)
+
+    def drift(s, parameters):
+        return rates(s * scale, here, parameters) / scale
+
+    # One Newton step from the solution, its matrix held constant, has the solution's derivative: -J^-1 df/dp.
+    s = jax.lax.stop_gradient(x0 / scale)
+    jacobian = jax.lax.stop_gradient(jax.jacfwd(drift)(s, parameters))
+    start = (s - jnp.linalg.solve(jacobian, drift(s, parameters))) * scale
+    steady = _measure(start, here, parameters)
+
+    def response(change):
+        u = here + change
+
+        def sample(x, _):
+            x = jnp.stack(runge_kutta(tuple(x), tuple(u), parameters, seconds, 1.0))
+            return x, _measure(x, u, parameters)
+
+        _, cv = jax.lax.scan(sample, start, length=samples)
+        return ((cv - steady) / jnp.sum(change)).T
+
+    changes = jnp.array([[STEPS[0], 0.0, 0.0], [0.0, STEPS[1], 0.0]])
+    return steady, jax.vmap(response, out_axes=1)(changes)
+
+
+@jax.jit
+def _settle(theta, guess, point, prior):
+    found = steady_state(point[0], point[1], 0.0, _unpack(theta, prior), guess)
+    return found.x, found.converged
+
+
+def _errors(theta, x0, point, target, measured, prior, seconds):
+    """Weighted errors of responses, parameters and steady rates; and the responses."""
+    steady, response = simulate_steps(_unpack(theta, prior), x0, point, seconds, target.shape[-1])
+    # The samples of a response are not independent: all of them together count as `RESPONSE_COUNT`.
+    peak = jnp.abs(target).max(axis=-1, keepdims=True)
+    weight = np.sqrt(RESPONSE_COUNT / target.shape[-1]) / (RESPONSE_ERROR * peak)
+    parts = (((response - target) * weight).ravel(), theta, (steady / measured - 1) / RATE_ERROR)
+    return jnp.concatenate(parts), response
+
+
+_value = jax.jit(_errors, static_argnums=6)
+_slope = jax.jit(lambda *a: jax.jacfwd(lambda t: _errors(t, *a[1:])[0])(a[0]), static_argnums=6)
 
 
 def fit_well(data: StepData, prior: WellParameters | None = None, steps: int = 30) -> Fit:
     """Fit the well to step responses by Levenberg-Marquardt.
 
     Minimises the squared errors of the four responses (weighted with `RESPONSE_ERROR` of their peaks), of the
-    steady rates where they are known (`RATE_ERROR`), and of the parameters against the prior (`UNCERTAINTY`).
+    steady rates (`RATE_ERROR`), and of the parameters against the prior (`UNCERTAINTY`).
 
     Args:
         data: from `load_step_data`; its sampling interval must be a whole number of seconds.
@@ -210,36 +251,21 @@ def fit_well(data: StepData, prior: WellParameters | None = None, steps: int = 3
     """
     if abs(data.dt - round(data.dt)) > 1e-9 or data.dt < 1:
         raise InputError("data.sampling_seconds", data.dt, "a whole number of seconds")
-    prior = WellParameters() if prior is None else prior
-    peak = jnp.asarray(np.abs(data.coefficients).max(axis=-1, keepdims=True))
-
-    @jax.jit
-    def solve(theta, guess):
-        found = steady_state(data.choke, data.lift, 0.0, _unpack(theta, prior), guess)
-        return found.x, found.converged
-
-    def errors(theta, x0):
-        steady, response = _simulate(_unpack(theta, prior), x0, data)
-        # The samples of a response are not independent: all of them together count as ten.
-        weight = jnp.sqrt(10.0 / data.coefficients.shape[-1]) / (RESPONSE_ERROR * peak)
-        parts = [((response - data.coefficients) * weight).ravel(), theta]
-        if data.rates is not None:
-            parts.append((steady / data.rates - 1) / RATE_ERROR)
-        return jnp.concatenate(parts), response
-
-    value = jax.jit(errors)
-    slope = jax.jit(jax.jacfwd(lambda theta, x0: errors(theta, x0)[0]))
+    prior = check_parameters(WellParameters() if prior is None else prior, "prior")
+    point = jnp.array([data.choke, data.lift])
     theta, damping = jnp.zeros(len(UNCERTAINTY)), 1e-3
-    x0, _ = solve(theta, None)
-    current, response = value(theta, x0)
+    x0, _ = _settle(theta, jnp.asarray(SHIPPED_STEADY_STATE), point, prior)
+    measured = _measure(x0, jnp.append(point, 0.0), prior) if data.rates is None else jnp.asarray(data.rates)
+    rest = (point, jnp.asarray(data.coefficients), measured, prior, round(data.dt))
+    current, response = _value(theta, x0, *rest)
     cost, converged = [0.5 * float(current @ current)], False
     for _ in range(steps):
-        jacobian = slope(theta, x0)
+        jacobian = _slope(theta, x0, *rest)
         normal, gradient = jacobian.T @ jacobian, jacobian.T @ current
         while damping < 1e8:
             move = -jnp.linalg.solve(normal + damping * jnp.diag(jnp.diag(normal)), gradient)
-            x_new, found = solve(theta + move, x0)
-            trial, trial_response = value(theta + move, x_new)
+            x_new, found = _settle(theta + move, x0, point, prior)
+            trial, trial_response = _value(theta + move, x_new, *rest)
             cost_new = 0.5 * float(trial @ trial)
             if bool(found) and np.isfinite(cost_new) and cost_new <= cost[-1]:
                 break
@@ -252,8 +278,7 @@ def fit_well(data: StepData, prior: WellParameters | None = None, steps: int = 3
         converged = bool(jnp.max(jnp.abs(move)) < 1e-4)
         if converged:
             break
-    fitted = _unpack(theta, prior)
-    fitted = WellParameters(**{k: float(v) for k, v in parameters_to_dict(fitted).items()})
+    fitted = WellParameters(**parameters_to_dict(_unpack(theta, prior)))
     return _report(fitted, np.asarray(response), data, cost, converged)
 
 
@@ -262,3 +287,61 @@ def _report(parameters, response, data: StepData, cost, converged) -> Fit:
     variance = ((data.coefficients - data.coefficients.mean(axis=-1, keepdims=True)) ** 2).sum(axis=-1)
     largest = np.abs(error).max(axis=-1) / np.abs(data.coefficients).max(axis=-1)
     return Fit(parameters, 1 - (error**2).sum(axis=-1) / variance, largest, response, cost, converged)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line: fit the well to a file of step responses and write its parameters. Returns 0, or 2."""
+    parser = argparse.ArgumentParser(
+        prog="python -m identify.fit", description="Fit the well to step responses."
+    )
+    parser.add_argument(
+        "data", help="step responses: a model of `jaxmpc identify`, or a published table (JSON)"
+    )
+    parser.add_argument("--out", help="where to write the parameters (JSON); printed by default")
+    parser.add_argument("--prior", help="parameters to start from (JSON; default: the shipped well)")
+    parser.add_argument("--gas-rate", type=float, help="steady gas rate at the working point [m3/h]")
+    parser.add_argument("--oil-rate", type=float, help="steady oil rate at the working point [m3/h]")
+    given = parser.parse_args(arguments)
+    try:
+        data = load_step_data(given.data)
+        prior = load_parameters(given.prior) if given.prior else WellParameters()
+        if (given.gas_rate is None) != (given.oil_rate is None):
+            raise InputError("--gas-rate and --oil-rate", "one of them", "both or neither [m3/h]")
+        if given.gas_rate is not None:
+            if not (0 < given.gas_rate < np.inf and 0 < given.oil_rate < np.inf):
+                raise InputError(
+                    "--gas-rate and --oil-rate", (given.gas_rate, given.oil_rate), "above zero [m3/h]"
+                )
+            data = data._replace(rates=np.array([given.gas_rate, given.oil_rate]))
+        if given.out and Path(given.out).is_dir():
+            raise InputError("--out", given.out, "the path of a file")
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    fit = fit_well(data, prior)
+    for i, cv in enumerate(CV_NAMES):
+        for j, mv in enumerate(MV_NAMES):
+            print(
+                f"{cv} <- {mv}: R2 {fit.r_squared[i, j]:.4f}, largest error "
+                f"{100 * fit.largest_error[i, j]:.1f} % of the peak",
+                file=sys.stderr,
+            )
+    if data.rates is None:
+        print("Steady rates were not given and kept near the prior's.", file=sys.stderr)
+    if not fit.converged:
+        print("The fit did not converge; this is the best that was found.", file=sys.stderr)
+    if given.out:
+        facts = {
+            "r_squared": fit.r_squared.tolist(),
+            "largest_error": fit.largest_error.tolist(),
+            "converged": fit.converged,
+            "fitted_to": Path(given.data).name,
+        }
+        print(save_parameters(fit.parameters, given.out, **facts), file=sys.stderr)
+    else:
+        print(json.dumps(parameters_to_dict(fit.parameters), indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -19,6 +19,7 @@ import tempfile
 import weakref
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -198,9 +199,9 @@ class FmuPlant:
         self._references = {kind: [references[n] for n in group] for kind, group in names.items()}
         self._switch = [references["SepticControl"]]
         self.token = description.guid
-        self.fmi = 3 if description.fmiVersion.startswith("3") else 2
+        self.fmi = 3 if str(description.fmiVersion).startswith("3") else 2
         slave = FMU3Slave if self.fmi == 3 else FMU2Slave
-        self._fmu = slave(
+        self._fmu: Any = slave(
             guid=description.guid,
             unzipDirectory=self._folder,
             modelIdentifier=description.coSimulation.modelIdentifier,

@@ -143,7 +143,14 @@ def _variables(parameters: WellParameters) -> list[dict]:
     start = start_state(parameters)
     inputs = (DEFAULT_CHOKE, DEFAULT_LIFT, 0.0)
     rows = [
-        {"name": name, "vr": VR_INPUT + i, "unit": unit, "text": text, "causality": "input", "start": inputs[i]}
+        {
+            "name": name,
+            "vr": VR_INPUT + i,
+            "unit": unit,
+            "text": text,
+            "causality": "input",
+            "start": inputs[i],
+        }
         for i, (name, unit, text) in enumerate(INPUTS)
     ]
     rows.append(
@@ -234,7 +241,8 @@ def model_description(fmi: int, token: str, parameters: WellParameters) -> str:
   </UnitDefinitions>
   {experiment}
   <ModelVariables>
-    <Float64 name="time" valueReference="{VR_TIME}" causality="independent" variability="continuous" unit="s"/>
+    <Float64 name="time" valueReference="{VR_TIME}" causality="independent" variability="continuous"
+      unit="s"/>
 {variables}
   </ModelVariables>
   <ModelStructure>{listed}</ModelStructure>

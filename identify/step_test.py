@@ -57,7 +57,13 @@ def settling(model: StepResponseModel) -> list[Settling]:
             last = int(outside[-1]) + 1 if outside.size else 0
             found.append(
                 Settling(
-                    cv, mv, movement < SETTLED_SHARE, movement, float(s[-1]), float(peak), (last + 1) * model.dt
+                    cv,
+                    mv,
+                    movement < SETTLED_SHARE,
+                    movement,
+                    float(s[-1]),
+                    float(peak),
+                    (last + 1) * model.dt,
                 )
             )
     return found
@@ -73,7 +79,9 @@ def settling_notes(model: StepResponseModel) -> list[str]:
     ]
 
 
-def apply_sequence(plant: Any, choke: float, lift: float, demands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def apply_sequence(
+    plant: Any, choke: float, lift: float, demands: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Start a plant at a working point and apply a sequence of demands.
 
     Args:
@@ -138,7 +146,9 @@ def identify_step_response(
         cv, mv = apply_sequence(plant, choke, lift, demands)
         made = mv[-1] - point
         if abs(made[j] - step) > 1e-9 * max(1.0, abs(step)):
-            raise InputError(f"steps[{j}]", step, f"a step that the actuator makes ({MV_NAMES[j]} moved {made[j]})")
+            raise InputError(
+                f"steps[{j}]", step, f"a step that the actuator makes ({MV_NAMES[j]} moved {made[j]})"
+            )
         base = cv[SETTLE_SAMPLES - 1]
         responses.append((cv[SETTLE_SAMPLES:] - base).T / step)
     facts = {

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.errors import InputError
-from jaxmpc.plant import WellPlant, check_inputs, steady_state
-from jaxmpc.well import CV_NAMES
+from jaxmpc.plant import STATE_SCALE, WellPlant, check_inputs, rates, steady_state
+from jaxmpc.well import CV_NAMES, WellParameters
 
 LIFTS = (5000.0, 7500.0, 10000.0)  # m3/h, the three curves of figures 10 and 11
 
@@ -26,8 +26,8 @@ class SteadySweep(NamedTuple):
         choke: ``"choke"``, positions [%].
         lift: ``"lift"``, rates [m3/h].
         cv: ``"cv lift choke"``, steady gas and oil rates [m3/h].
-        coefficient: ``"cv lift choke-1"``, change of the steady CV from each position to the next, per % choke
-            [m3/h per %]; entry i belongs to a step from `choke[i]`.
+        coefficient: ``"cv lift choke-1"``, change of the steady CV from each position to the next
+            [m3/h per % choke]; entry i belongs to a step from `choke[i]`.
         converged: ``"lift choke"``, whether the steady state was found.
         cv_names: names of the CVs.
     """
@@ -38,6 +38,72 @@ class SteadySweep(NamedTuple):
     coefficient: np.ndarray
     converged: np.ndarray
     cv_names: tuple[str, ...] = CV_NAMES
+
+
+class Stability(NamedTuple):
+    """How the well returns to its steady states, from the linearised model.
+
+    Attributes:
+        choke: ``"choke"``, positions [%].
+        lift: ``"lift"``, rates [m3/h].
+        growth: ``"lift choke"``, of the slowest mode [1/s]; above zero the steady state is unstable.
+        frequency: ``"lift choke"``, of the least damped oscillation [rad/s]; 0 where nothing oscillates.
+        damping: ``"lift choke"``, its damping ratio [1]; 1 where nothing oscillates.
+    """
+
+    choke: np.ndarray
+    lift: np.ndarray
+    growth: np.ndarray
+    frequency: np.ndarray
+    damping: np.ndarray
+
+
+@jax.jit
+def _linearise(choke, lift, parameters):
+    scale = jnp.asarray(STATE_SCALE)
+
+    def one(choke, lift):
+        found = steady_state(choke, lift, 0.0, parameters)
+        u = jnp.stack([choke, lift, 0.0])
+        return jax.jacfwd(lambda s: rates(s * scale, u, parameters) / scale)(found.x / scale), found.converged
+
+    return jax.vmap(one)(choke, lift)
+
+
+def stability_map(parameters: WellParameters | None = None, chokes=None, lifts=None) -> Stability:
+    """Where the well oscillates, and whether an oscillation grows (casing heading, thesis 6.7).
+
+    The shipped well has no growing oscillation. After a disturbance it swings back: from 2000 m3/h of lift on
+    the least damping ratio is 0.54, and it falls to 0.41 at 500 m3/h with the choke fully open, where one swing
+    takes 44 minutes and the slowest mode 15.
+
+    Args:
+        parameters: of the well; the shipped ones by default.
+        chokes: positions [%] above 0.
+        lifts: rates [m3/h] above 0; a shut or unlifted well has no unique steady state.
+
+    Raises:
+        InputError: for inputs outside their range, or where no steady state was found.
+    """
+    parameters = WellParameters() if parameters is None else parameters
+    chokes = np.array([2, 5, 10, 20, 30, 50, 70, 100.0]) if chokes is None else np.asarray(chokes, np.float64)
+    lifts = np.array([200, 500, 1000, 2000, 5000, 1e4]) if lifts is None else np.asarray(lifts, np.float64)
+    check_inputs(chokes, lifts)
+    lift_grid, choke_grid = np.meshgrid(lifts, chokes, indexing="ij")
+    matrices, converged = _linearise(
+        jnp.asarray(choke_grid.ravel()), jnp.asarray(lift_grid.ravel()), parameters
+    )
+    if not np.all(converged):
+        where = int(np.argmin(converged))
+        point = (choke_grid.ravel()[where], lift_grid.ravel()[where])
+        raise InputError("choke, gas_lift", point, "inputs [%, m3/h] with a steady state")
+    modes = np.linalg.eigvals(np.asarray(matrices))
+    swinging = np.abs(modes.imag) > 1e-3 * np.abs(modes)
+    ratio = np.where(swinging, -modes.real / np.abs(modes), 1.0)
+    least = np.argmin(ratio, axis=1)[:, None]
+    frequency = np.take_along_axis(np.where(swinging, np.abs(modes.imag), 0.0), least, axis=1)
+    shaped = (v.reshape(choke_grid.shape) for v in (modes.real.max(axis=1), frequency, ratio.min(axis=1)))
+    return Stability(chokes, lifts, *shaped)
 
 
 @jax.jit

@@ -38,6 +38,12 @@ def sample_moves(structure: Structure) -> Float[np.ndarray, "sample block"]:
 
 
 @functools.lru_cache(maxsize=64)
+def block_members(structure: Structure) -> Float[np.ndarray, "sample block"]:
+    """Which samples belong to which block."""
+    return np.repeat(np.eye(structure.block_count), structure.blocks, axis=0)
+
+
+@functools.lru_cache(maxsize=64)
 def position_rows(structure: Structure) -> Float[np.ndarray, "block block"]:
     """Change of the MV at the end of each block; with a constant move in a block its ends bound all samples."""
     return np.tril(np.ones((structure.block_count, structure.block_count))) * moves_per_block(structure)

@@ -244,7 +244,11 @@ def _study_thesis(options: argparse.Namespace) -> int:
     _check_writable("--out", options.out / "results")
     from studies.thesis import run_thesis
 
-    run_thesis(options.out, options.quick, options.plant)
+    folder = run_thesis(options.out, options.quick, options.plant)
+    from figures.thesis import draw_all
+
+    draw_all(folder)
+    print(f"Summary: {folder / 'summary.md'}, figures: {folder / 'figures'}")
     return EXIT_OPTIMAL
 
 

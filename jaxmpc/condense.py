@@ -117,6 +117,7 @@ def condense(
     *,
     envelope: int = 1,
     has_limits: bool = True,
+    packed: bool = True,
 ) -> CondensedQp:
     """Build the constant part of the condensed problem (5.8)-(5.13), (6.6).
 
@@ -127,6 +128,7 @@ def condense(
         envelope: largest whole number of steps an integer move can make, for the envelope of its weight; 0 keeps the
             plain square.
         has_limits: whether any CV limit is finite (static; False drops their rows from the solver).
+        packed: whether to keep the packed products of `theta` (up to 64 variables).
     """
     blocks, mvs, rows = structure.block_count, structure.mv_count, structure.cv_count * structure.horizon_count
     full = dynamic_matrix(structure, coefficients)[:, structure.first_penalised - 1 :]
@@ -152,13 +154,11 @@ def condense(
     theta = jnp.concatenate([theta, jnp.tile(unit, (len(steps), 1))])
     pad = lambda values, tail: jnp.concatenate([values, tail])  # noqa: E731
     slope = jnp.concatenate([(1.0 if m == 0 else 2.0) * weight[integer] for m in steps])
-    packed = None
-    if mvs * blocks <= PACKED_LIMIT:
-        first, second = np.triu_indices(mvs * blocks)
-        packed = theta[:, first] * theta[:, second]
+    first, second = np.triu_indices(mvs * blocks)
+    pay = packed and mvs * blocks <= PACKED_LIMIT
     return CondensedQp(
         theta=theta,
-        packed=packed,
+        packed=theta[:, first] * theta[:, second] if pay else None,
         hessian=tracking + jnp.diag(2.0 * weight * own),
         curvature=tracking + jnp.diag(2.0 * weight),
         move_weight=weight * own,

@@ -27,6 +27,7 @@ from jaxmpc.status import FAILED, INFEASIBLE, LIMIT, OPTIMAL
 from jaxmpc.structure import Structure
 
 BATCHES = (1, 4, 16, 64)  # lanes of a relaxation call; one compilation each
+LEAN = 4  # lanes up to which the packed Gram matrix is left out
 FEW = 48  # combinations that are enumerated rather than searched
 HIGHS_SECONDS = 0.25  # what the reduced MILP may take before branch and bound closes the rest
 FINISHES = ("auto", "enumeration", "highs", "branch-and-bound")
@@ -62,6 +63,8 @@ class Constants:
 
     def __init__(self, structure: Structure, qp: CondensedQp):
         self.structure, self.qp = structure, qp
+        # few lanes do not pay for streaming the packed products through the cache
+        self.lean = eqx.tree_at(lambda q: q.packed, qp, None, is_leaf=lambda leaf: leaf is None)
         self.rows = hard_rows(structure)
         self.integer = integer_columns(structure)
         hessian = np.asarray(qp.hessian)
@@ -142,7 +145,8 @@ class Search:
             low, high = wide_low[start : start + BATCHES[-1]], wide_high[start : start + BATCHES[-1]]
             size = next(b for b in BATCHES if b >= len(low))
             pad = np.minimum(np.arange(size), len(low) - 1)
-            out = _relax(self.constants.qp, self.constants.rows, self.instance, low[pad], high[pad])
+            qp = self.constants.lean if size <= LEAN else self.constants.qp
+            out = _relax(qp, self.constants.rows, self.instance, low[pad], high[pad])
             parts.append([np.asarray(v)[: len(low)] for v in out])
         return Relaxations(*(np.concatenate(v) for v in zip(*parts, strict=True)))
 

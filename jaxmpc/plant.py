@@ -15,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmpc.actuator import check_actuator, move_choke
@@ -35,11 +36,14 @@ STEADY_HOURS = 48
 NEWTON_STEPS = 25
 
 
-class _JaxOps:
+class JaxOps:
+    """What `jaxmpc.well.model` needs beyond arithmetic, for JAX arrays."""
+
     sqrt = staticmethod(jnp.sqrt)
 
     @staticmethod
     def positive(x):
+        """The larger of x and 0."""
         return jnp.maximum(x, 0.0)
 
 
@@ -101,14 +105,14 @@ class SteadyState(NamedTuple):
 
 def rates(x: Float[Array, "8"], u: Float[Array, "3"], parameters: WellParameters) -> Float[Array, "8"]:
     """Time derivative of the well's state [state unit per second]; `u` as in `jaxmpc.well.INPUTS`."""
-    return jnp.stack(model(_JaxOps, tuple(x), tuple(u), parameters)[0])
+    return jnp.stack(model(JaxOps, tuple(x), tuple(u), parameters)[0])
 
 
 def runge_kutta(x: tuple, u: tuple, parameters: WellParameters, steps, substep: float) -> tuple:
     """Integrate over `steps` classical fourth-order Runge-Kutta steps of `substep` seconds, inputs held."""
 
     def slope(x):
-        return model(_JaxOps, x, u, parameters)[0]
+        return model(JaxOps, x, u, parameters)[0]
 
     def ahead(x, k, h):
         return tuple(a + h * b for a, b in zip(x, k, strict=True))
@@ -203,7 +207,7 @@ def _known(choke, lift, disturbance, parameters) -> bool:
 
 
 def _outputs(x, position, lift, disturbance, parameters) -> WellOutputs:
-    _, y = model(_JaxOps, tuple(x), (position, lift, disturbance), parameters)
+    _, y = model(JaxOps, tuple(x), (position, lift, disturbance), parameters)
     return WellOutputs(jnp.stack(y[:2]), jnp.stack([position, lift]), *y[2:])
 
 
@@ -230,7 +234,7 @@ class WellPlant(eqx.Module):
         if abs(self.dt / self.substep - self.steps) > 1e-9 or self.steps < 1:
             raise InputError("plant.dt", self.dt, f"a whole number of substeps of {self.substep} s")
         check_actuator(self.actuator, "plant.actuator")
-        if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self.parameters)):
+        if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(self.parameters)):
             check_parameters(self.parameters, "plant.parameters")
 
     @property
@@ -256,7 +260,9 @@ class WellPlant(eqx.Module):
             x = _steady_state(choke, lift, disturbance, self.parameters).x
         return WellState(x, jnp.asarray(choke, dtype=jnp.float64), jnp.asarray(lift, dtype=jnp.float64))
 
-    def step(self, state: WellState, mv: Float[Array, "2"], disturbance=0.0) -> tuple[WellState, WellOutputs]:
+    def step(
+        self, state: WellState, mv: Float[Array, "2"], disturbance: Any = 0.0
+    ) -> tuple[WellState, WellOutputs]:
         """One sample: move the actuators, hold the inputs for `dt`, and measure at the end.
 
         Args:
@@ -268,7 +274,7 @@ class WellPlant(eqx.Module):
             ``(state, outputs)`` at the end of the sample. Not a number in gives not a number out.
         """
         mv = jnp.asarray(mv, dtype=jnp.float64)
-        position = move_choke(self.actuator, state.position, mv[0])
+        position = jnp.asarray(move_choke(self.actuator, state.position, mv[0]))
         lift = jnp.maximum(mv[1], 0.0)
         offset = jnp.asarray(disturbance, dtype=jnp.float64)
         u = (position, lift, offset)
@@ -295,7 +301,7 @@ class WellPlant(eqx.Module):
         """
         mv = jnp.asarray(mv, dtype=jnp.float64)
         offsets = jnp.broadcast_to(jnp.asarray(disturbance, dtype=jnp.float64), mv.shape[:1])
-        return jax.lax.scan(lambda s, i: self.step(s, *i), state, (mv, offsets))
+        return jax.lax.scan(lambda s, now: self.step(s, now[0], now[1]), state, (mv, offsets))
 
     def with_actuator(self, actuator: str) -> WellPlant:
         """The same well with another choke actuator."""
@@ -314,7 +320,7 @@ def check_inputs(choke, lift, disturbance=0.0) -> None:
         ("reservoir_pressure_offset", disturbance, -np.inf, np.inf, "a finite pressure change [bar]"),
     )
     for name, value, low, high, expected in limits:
-        if isinstance(value, jax.core.Tracer):
+        if isinstance(value, Tracer):
             continue
         try:
             number = np.asarray(value, dtype=np.float64)

@@ -24,7 +24,11 @@ from jaxmpc.condense import CondensedQp, QpInstance
 from jaxmpc.status import FAILED, OPTIMAL
 
 MAX_ITERATIONS = 60
-TOLERANCE = 1e-9  # of the scaled residuals and of the complementarity
+PATIENCE = 15  # iterations without progress after which a lane gives up
+TOLERANCE = 1e-9  # of the scaled residuals and of the relative complementarity gap
+ACCEPTABLE = 1e-6  # residual up to which a stalled lane still counts as solved
+LEAST_WORTH = 1e-6  # objective [solver units] below which the gap is measured against this
+LEAST_PRODUCT, ROOM, STEP = 1e-2, 0.1, 0.995  # start: least slack * price, least slack; share of the way to the edge
 FIXED = 1e-9  # box width [scaled moves] below which a variable is a constant
 TINY = 1e-300
 
@@ -80,357 +84,307 @@ def _limit_cost(qp: CondensedQp, instance: QpInstance, t):
     return rho * jnp.maximum(jnp.concatenate([over, under]), 0.0)
 
 
-class _Rows(NamedTuple):
-    """One family of inequalities: slack, multiplier, and which rows take part."""
-
-    slack: Array
-    price: Array
-
-
 class _State(NamedTuple):
+    """Iterate of one lane; slack and price hold all families of inequalities, see `_Layout`."""
+
     x: Array
+    t: Array
     eps: Array
     eta: Array
-    above: _Rows  # eta + c - t >= 0
-    below: _Rows  # eta + c + t >= 0
-    beyond: _Rows  # eta >= 0
-    high: _Rows  # eps_high + limit_high - t >= 0
-    low: _Rows  # eps_low + t - limit_low >= 0
-    slack: _Rows  # eps >= 0
-    box_low: _Rows
-    box_high: _Rows
-    row_low: _Rows
-    row_high: _Rows
+    slack: Array
+    price: Array
+    primal: Array
+    dual: Array
     iterations: Array
     residual: Array
     best: Array
     stalled: Array
 
 
-FAMILIES = ("above", "below", "beyond", "high", "low", "slack", "box_low", "box_high", "row_low", "row_high")
+class _Layout:
+    """Where each family of inequalities stands in the vectors of slacks and prices.
+
+    above: eta + c - t, below: eta + c + t, beyond: eta; high: eps_high + limit_high - t, low: eps_low + t - limit_low,
+    relief: eps; then the limits of x and the hard rows. All are >= 0 at a solution.
+    """
+
+    def __init__(self, rows: int, predictions: int, groups: int, n: int, hard: int):
+        sizes = (rows, rows, rows, predictions, predictions, groups, n, n, hard, hard)
+        names = ("above", "below", "beyond", "high", "low", "relief", "box_low", "box_high", "row_low", "row_high")
+        ends = np.cumsum(sizes)
+        self.parts = {k: slice(e - size, e) for k, size, e in zip(names, sizes, ends, strict=True)}
+        self.sizes = dict(zip(names, sizes, strict=True))
+
+    def split(self, vector) -> dict[str, Array]:
+        """Families of a vector."""
+        return {name: vector[part] for name, part in self.parts.items()}
+
+    def join(self, families: dict[str, Array]):
+        """One vector of all families."""
+        return jnp.concatenate([families[name] for name in self.parts])
 
 
 def solve(
     qp: CondensedQp,
-    rows: np.ndarray,
+    rows: Float[Array, "hard n"] | np.ndarray,
     instance: QpInstance,
     lower: Float[Array, " n"],
     upper: Float[Array, " n"],
-    start: Float[Array, " n"] | None = None,
 ) -> QpSolution:
     """Solve one relaxed problem (one lane; use `jax.vmap` for a batch).
 
     Args:
         qp: constant part.
-        rows: hard rows, `blocking.hard_rows(structure)` ("hard n").
+        rows: hard rows, `blocking.hard_rows(structure)`.
         instance: offsets and limits of this sample.
         lower, upper: limits of x that replace the instance's (a search tightens them); equal limits fix a move.
-        start: moves to start from, for example the previous plan shifted; need not be feasible.
 
     Returns:
         `QpSolution`; a lane that did not converge has status `FAILED` and still a valid bound.
     """
-    n, cvs = lower.shape[0], qp.slack_weight.shape[0]
-    predictions = instance.limit_high.shape[0]
-    free = (upper - lower) > FIXED
-    fixed_value = jnp.where(free, 0.0, 0.5 * (lower + upper))
+    n, cvs, rows_count = lower.shape[0], qp.slack_weight.shape[0], qp.theta.shape[0]
+    predictions = instance.limit_high.shape[0] if qp.has_limits else 0
+    all_predictions = instance.limit_high.shape[0]
+    groups = 2 * cvs if qp.has_limits else 0
+    horizon = all_predictions // cvs
     w_matrix = jnp.asarray(rows)
+    layout = _Layout(rows_count, predictions, groups, n, w_matrix.shape[0])
+    free = (upper - lower) > FIXED
+    keep = free.astype(lower.dtype)
+    fixed_value = jnp.where(free, 0.0, 0.5 * (lower + upper))
     # rows without free moves are constants and leave the solver; feasibility of the whole is checked outside
-    takes_part = (jnp.abs(w_matrix) @ free.astype(float)) > 0.0
-    own_quadratic = qp.hessian
+    takes_part = (jnp.abs(w_matrix) @ keep) > 0.0
     offset = instance.offset
-    scale = jnp.maximum(jnp.max(jnp.diagonal(qp.curvature)), 1e-12)
     gradient0 = 2.0 * (qp.quadratic * offset) @ qp.theta
-    scale = jnp.maximum(scale, 1e-2 * jnp.max(jnp.abs(gradient0)))
-    hessian = own_quadratic / scale
-    linear = gradient0 / scale
-    s2, s1, c = 2.0 * qp.soft_quadratic / scale, qp.soft_linear / scale, qp.deadzone
-    active_soft = (s2 + s1) > 0.0
-    rho = jnp.concatenate([qp.slack_weight, qp.slack_weight]) / scale
-    masks = {
-        "above": active_soft,
-        "below": active_soft,
-        "beyond": active_soft,
-        "box_low": free & jnp.isfinite(lower),
-        "box_high": free & jnp.isfinite(upper),
-        "row_low": takes_part & jnp.isfinite(instance.row_low),
-        "row_high": takes_part & jnp.isfinite(instance.row_high),
-    }
-    if qp.has_limits:
-        rho_rows = jnp.repeat(rho, predictions // cvs)
-        masks["high"] = jnp.isfinite(instance.limit_high) & (rho_rows[:predictions] > 0.0)
-        masks["low"] = jnp.isfinite(instance.limit_low) & (rho_rows[predictions:] > 0.0)
-        masks["slack"] = jnp.any(jnp.concatenate([masks["high"], masks["low"]]).reshape(2 * cvs, -1), axis=1)
-    else:
-        masks["high"] = masks["low"] = jnp.zeros(0, dtype=bool)
-        masks["slack"] = jnp.zeros(0, dtype=bool)
-    count = jnp.maximum(sum(jnp.sum(mask) for mask in masks.values()), 1)
-    groups = (2 * cvs, predictions // cvs)
-    limit_high = jnp.where(masks["high"], instance.limit_high, 0.0) if qp.has_limits else jnp.zeros(0)
-    limit_low = jnp.where(masks["low"], instance.limit_low, 0.0) if qp.has_limits else jnp.zeros(0)
-    box_low = jnp.where(masks["box_low"], lower, 0.0)
-    box_high = jnp.where(masks["box_high"], upper, 0.0)
-    row_low = jnp.where(masks["row_low"], instance.row_low, 0.0)
-    row_high = jnp.where(masks["row_high"], instance.row_high, 0.0)
-    pairs = np.triu_indices(n)
+    unit = jnp.maximum(jnp.max(jnp.diagonal(qp.curvature)), 1e-12)
+    unit = jnp.maximum(unit, 1e-2 * jnp.max(jnp.abs(gradient0)))
+    hessian, linear = qp.hessian / unit, gradient0 / unit
+    s2, s1, c = 2.0 * qp.soft_quadratic / unit, qp.soft_linear / unit, qp.deadzone
+    soft = (s2 + s1) > 0.0
+    rho = jnp.concatenate([qp.slack_weight, qp.slack_weight])[:groups] / unit
+    priced = jnp.repeat(rho > 0.0, horizon)
+    high_on = jnp.isfinite(instance.limit_high[:predictions]) & priced[:predictions]
+    low_on = jnp.isfinite(instance.limit_low[:predictions]) & priced[predictions:]
+    relief_on = jnp.any(jnp.concatenate([high_on, low_on]).reshape(groups, -1), axis=1) if groups else high_on
+    mask = layout.join(
+        {
+            "above": soft,
+            "below": soft,
+            "beyond": soft,
+            "high": high_on,
+            "low": low_on,
+            "relief": relief_on,
+            "box_low": free & jnp.isfinite(lower),
+            "box_high": free & jnp.isfinite(upper),
+            "row_low": takes_part & jnp.isfinite(instance.row_low),
+            "row_high": takes_part & jnp.isfinite(instance.row_high),
+        }
+    )
+    count = jnp.maximum(jnp.sum(mask), 1)
+    on = layout.split(mask)
+    finite = lambda value, where: jnp.where(where, value, 0.0)  # noqa: E731
+    limit_high = finite(instance.limit_high[:predictions], high_on)
+    limit_low = finite(instance.limit_low[:predictions], low_on)
+    box_low, box_high = finite(lower, on["box_low"]), finite(upper, on["box_high"])
+    row_low, row_high = finite(instance.row_low, on["row_low"]), finite(instance.row_high, on["row_high"])
+    first, second = np.triu_indices(n)
     back = np.zeros((n, n), dtype=np.int32)
-    back[pairs] = np.arange(len(pairs[0]))
-    back = np.maximum(back, back.T)
+    back[first, second] = back[second, first] = np.arange(len(first))
 
     def gram(weights):
         if qp.packed is not None:
             return jnp.take(weights @ qp.packed, back.reshape(-1)).reshape(n, n)
         return qp.theta.T @ (weights[:, None] * qp.theta)
 
-    def predictions_of(vector):
-        return vector[:predictions]
+    def per_prediction(values):  # one value per CV and side, spread over the horizon: high sides, low sides
+        wide = jnp.repeat(values, horizon) if groups else values
+        return wide[:predictions], wide[predictions:]
 
-    def gather(price_high, price_low):  # net price on all rows of theta
-        if not qp.has_limits:
-            return jnp.zeros(qp.theta.shape[0])
-        return jnp.concatenate([price_high - price_low, jnp.zeros(qp.theta.shape[0] - predictions)])
+    def per_group(high, low):
+        return jnp.sum(jnp.concatenate([high, low]).reshape(groups, -1), axis=1) if groups else high
 
-    def by_group(high, low):
-        return jnp.concatenate([high, low]).reshape(groups)
+    def on_rows(values):  # predictions come first among the rows
+        return jnp.concatenate([values, jnp.zeros(rows_count - predictions)])
 
-    # ---- start: slack rows exactly feasible, eta and eps with dual-feasible prices
-    middle = 0.5 * (jnp.clip(lower, -10.0, 10.0) + jnp.clip(upper, -10.0, 10.0))
-    x = middle if start is None else 0.8 * jnp.clip(start, lower, upper) + 0.2 * jnp.clip(middle, lower, upper)
-    x = jnp.where(free, x, fixed_value)
+    def dual_residual(x, price):
+        p = layout.split(price)
+        net = p["above"] - p["below"] + on_rows(p["high"] - p["low"])
+        value = hessian @ x + linear + net @ qp.theta + p["box_high"] - p["box_low"]
+        return keep * (value + (p["row_high"] - p["row_low"]) @ w_matrix)
+
+    def worth_of(x, t):  # objective in the solver's units
+        beyond = jnp.maximum(jnp.abs(t) - c, 0.0)
+        rows_cost = jnp.sum(qp.quadratic * t**2) / unit + jnp.sum((0.5 * s2 * beyond + s1) * beyond)
+        return rows_cost + jnp.sum(qp.move_weight * x**2) / unit + jnp.sum(_limit_cost(qp, instance, t)) / unit
+
+    # ---- start: slack rows exactly feasible, prices of eta and eps exactly dual feasible
+    x = jnp.where(free, 0.5 * (jnp.clip(lower, -10.0, 10.0) + jnp.clip(upper, -10.0, 10.0)), fixed_value)
     t = qp.theta @ x + offset
-    reach = 0.1 * jnp.sqrt(jnp.sum(qp.theta**2, axis=1)) + 1e-12
+    reach = jnp.sqrt(jnp.sum(qp.theta**2, axis=1)) + 1e-12
     eta = jnp.maximum(jnp.abs(t) - c, 0.0) + reach
-    slack3 = (eta + c - t, eta + c + t, eta)
-    total = s2 * eta + s1
-    share = total / sum(1.0 / s for s in slack3)
-    families = {
-        name: _Rows(jnp.where(active_soft, s, 1.0), jnp.where(active_soft, share / s, 0.0))
-        for name, s in zip(("above", "below", "beyond"), slack3, strict=True)
-    }
-    if qp.has_limits:
-        y = predictions_of(t)
-        over = jnp.max(by_group(jnp.where(masks["high"], y - limit_high, -jnp.inf), jnp.where(masks["low"], limit_low - y, -jnp.inf)), axis=1)
-        reach_group = jnp.max(by_group(predictions_of(reach), predictions_of(reach)), axis=1) * 10.0
-        eps = jnp.where(masks["slack"], jnp.maximum(over, 0.0) + reach_group, 0.0)
-        eps_rows = jnp.repeat(eps, groups[1])
-        s_high = jnp.where(masks["high"], eps_rows[:predictions] + limit_high - y, 1.0)
-        s_low = jnp.where(masks["low"], eps_rows[predictions:] + y - limit_low, 1.0)
-        inverse = by_group(jnp.where(masks["high"], 1.0 / s_high, 0.0), jnp.where(masks["low"], 1.0 / s_low, 0.0))
-        share_group = rho / (jnp.sum(inverse, axis=1) + 1.0 / jnp.where(masks["slack"], eps, 1.0))
-        share_rows = jnp.repeat(share_group, groups[1])
-        families["high"] = _Rows(s_high, jnp.where(masks["high"], share_rows[:predictions] / s_high, 0.0))
-        families["low"] = _Rows(s_low, jnp.where(masks["low"], share_rows[predictions:] / s_low, 0.0))
-        families["slack"] = _Rows(
-            jnp.where(masks["slack"], eps, 1.0), jnp.where(masks["slack"], share_group / jnp.where(masks["slack"], eps, 1.0), 0.0)
-        )
+    inner = jnp.stack([eta + c - t, eta + c + t, eta])
+    share = (s2 * eta + s1) / jnp.sum(1.0 / inner, axis=0)
+    slack = dict(zip(("above", "below", "beyond"), inner, strict=True))
+    price = {name: share / value for name, value in slack.items()}
+    y = t[:predictions]
+    if groups:
+        over = jnp.where(high_on, y - limit_high, -jnp.inf), jnp.where(low_on, limit_low - y, -jnp.inf)
+        over = jnp.max(jnp.concatenate(over).reshape(groups, -1), axis=1)
+        eps = jnp.maximum(over, 0.0) + jnp.tile(jnp.max(reach[:predictions].reshape(cvs, -1), axis=1), 2)
     else:
         eps = jnp.zeros(0)
-        families |= dict.fromkeys(("high", "low", "slack"), _Rows(jnp.zeros(0), jnp.zeros(0)))
-    typical = jnp.maximum(sum(jnp.sum(f.slack * f.price) for f in families.values()) / count, 1e-2)
+    eps_high, eps_low = per_prediction(eps)
+    slack |= {"high": eps_high + limit_high - y, "low": eps_low + y - limit_low, "relief": eps}
+    safe = {name: jnp.where(on[name], slack[name], 1.0) for name in ("high", "low", "relief")}
+    inverse = per_group(finite(1.0 / safe["high"], high_on), finite(1.0 / safe["low"], low_on))
+    share = rho / (inverse + 1.0 / safe["relief"])
+    share_high, share_low = per_prediction(share)
+    price |= {"high": share_high / safe["high"], "low": share_low / safe["low"], "relief": share / safe["relief"]}
     wx = w_matrix @ x
-    for name, room in (
-        ("box_low", x - box_low),
-        ("box_high", box_high - x),
-        ("row_low", wx - row_low),
-        ("row_high", row_high - wx),
-    ):
-        room = jnp.maximum(room, 0.1)
-        families[name] = _Rows(jnp.where(masks[name], room, 1.0), jnp.where(masks[name], typical / room, 0.0))
-    state = _State(
+    room = {
+        "box_low": x - box_low,
+        "box_high": box_high - x,
+        "row_low": wx - row_low,
+        "row_high": row_high - wx,
+    }
+    soft_part = sum(jnp.sum(finite(slack[k] * price[k], on[k])) for k in price)
+    typical = jnp.maximum(soft_part / count, LEAST_PRODUCT)
+    slack |= {name: jnp.maximum(value, ROOM) for name, value in room.items()}
+    price |= {name: typical / slack[name] for name in room}
+    slack_vector = jnp.where(mask, layout.join(slack), 1.0)
+    price_vector = jnp.where(mask, layout.join(price), 0.0)
+    none = {k: jnp.zeros(layout.sizes[k]) for k in layout.parts if k not in room}
+    primal = finite(layout.join(none | {name: room[name] - slack[name] for name in room}), mask)
+    start = _State(
         x=x,
+        t=t,
         eps=eps,
         eta=eta,
+        slack=slack_vector,
+        price=price_vector,
+        primal=primal,
+        dual=dual_residual(x, price_vector),
         iterations=jnp.zeros((), dtype=jnp.int32),
         residual=jnp.asarray(jnp.inf),
         best=jnp.asarray(jnp.inf),
         stalled=jnp.zeros((), dtype=jnp.int32),
-        **families,
     )
 
-    def residuals(state: _State):
-        t_price = state.above.price - state.below.price + gather(state.high.price, state.low.price)
-        dual = hessian @ state.x + linear + t_price @ qp.theta
-        dual += state.box_high.price - state.box_low.price
-        dual += (state.row_high.price - state.row_low.price) @ w_matrix
-        dual = jnp.where(free, dual, 0.0)
-        wx = w_matrix @ state.x
-        primal = {
-            "box_low": state.x - box_low - state.box_low.slack,
-            "box_high": box_high - state.x - state.box_high.slack,
-            "row_low": wx - row_low - state.row_low.slack,
-            "row_high": row_high - wx - state.row_high.slack,
-        }
-        primal = {name: jnp.where(masks[name], value, 0.0) for name, value in primal.items()}
-        return dual, primal
-
     def iterate(state: _State) -> _State:
-        dual, primal = residuals(state)
-        weight = {
-            name: jnp.where(masks[name], getattr(state, name).price / getattr(state, name).slack, 0.0)
-            for name in FAMILIES
-        }
-        gap = sum(jnp.sum(jnp.where(masks[name], getattr(state, name).slack * getattr(state, name).price, 0.0)) for name in FAMILIES)
+        products = state.slack * state.price
+        gap = jnp.sum(products)
         mu = gap / count
-        eta_pivot = jnp.where(active_soft, s2 + weight["above"] + weight["below"] + weight["beyond"], 1.0)
-        both = weight["above"] + weight["below"]
-        skew = (weight["above"] - weight["below"]) / eta_pivot
-        row_weight = (both * (s2 + weight["beyond"]) + 4.0 * weight["above"] * weight["below"]) / eta_pivot
-        if qp.has_limits:
-            row_weight = row_weight.at[:predictions].add(weight["high"] + weight["low"])
-            sums = by_group(weight["high"], weight["low"])
-            eps_pivot = jnp.where(masks["slack"], jnp.sum(sums, axis=1) + weight["slack"], 1.0)
-            half = predictions // cvs
-            by_cv = predictions_of(qp.theta).reshape(cvs, half, n)
-            signed = sums.reshape(2, cvs, half) * jnp.asarray([1.0, -1.0])[:, None, None]
-            cross = jnp.einsum("scj,cjn->scn", signed, by_cv).reshape(2 * cvs, n)
+        weight = state.price / state.slack
+        w, prices = layout.split(weight), layout.split(state.price)
+        eta_pivot = jnp.where(soft, s2 + w["above"] + w["below"] + w["beyond"], 1.0)
+        skew = (w["above"] - w["below"]) / eta_pivot
+        row_weight = (w["above"] + w["below"]) * (s2 + w["beyond"]) + 4.0 * w["above"] * w["below"]
+        row_weight = row_weight / eta_pivot + on_rows(w["high"] + w["low"])
         matrix = hessian + gram(row_weight)
-        matrix += w_matrix.T @ ((weight["row_low"] + weight["row_high"])[:, None] * w_matrix)
-        diagonal = weight["box_low"] + weight["box_high"]
-        matrix = matrix + jnp.diag(diagonal)
-        if qp.has_limits:  # eps eliminated last: a border of two columns per CV
-            matrix = matrix - cross.T @ (cross / eps_pivot[:, None])
-        keep = free.astype(float)
+        matrix += w_matrix.T @ ((w["row_low"] + w["row_high"])[:, None] * w_matrix)
+        matrix += jnp.diag(w["box_low"] + w["box_high"])
+        if groups:  # eps eliminated last: a border of two columns per CV
+            eps_pivot = jnp.where(relief_on, per_group(w["high"], w["low"]) + w["relief"], 1.0)
+            signed = jnp.concatenate([w["high"], -w["low"]]).reshape(2, cvs, horizon)
+            by_cv = qp.theta[:predictions].reshape(cvs, horizon, n)
+            cross = jnp.einsum("scj,cjn->scn", signed, by_cv).reshape(groups, n)
+            matrix -= cross.T @ (cross / eps_pivot[:, None])
         matrix = matrix * keep[:, None] * keep[None, :] + jnp.diag(1.0 - keep + 1e-11)
         jacobi = 1.0 / jnp.sqrt(jnp.maximum(jnp.diagonal(matrix), TINY))
         factor = jnp.linalg.cholesky(matrix * jacobi[:, None] * jacobi[None, :] + 1e-14 * jnp.eye(n))
+        eta_residual = finite(s2 * state.eta + s1 - prices["above"] - prices["below"] - prices["beyond"], soft)
+        eps_residual = finite(rho - per_group(prices["high"], prices["low"]) - prices["relief"], relief_on)
 
         def direction(target):
-            """Newton direction for complementarity targets, target[name] = wanted slack * price."""
-            push = {
-                name: jnp.where(masks[name], target[name] / getattr(state, name).slack - getattr(state, name).price, 0.0)
-                for name in FAMILIES
-            }
-            eta_residual = jnp.where(
-                active_soft, s2 * state.eta + s1 - state.above.price - state.below.price - state.beyond.price, 0.0
-            )
+            """Newton direction towards slack * price = target."""
+            push_vector = finite(target / state.slack - state.price, mask)
+            push = layout.split(push_vector)
             eta_push = push["above"] + push["below"] + push["beyond"] - eta_residual
-            row_push = push["above"] - push["below"] - skew * eta_push
-            if qp.has_limits:
-                row_push = row_push.at[:predictions].add(push["high"] - push["low"])
-                eps_residual = jnp.where(
-                    masks["slack"], rho - jnp.sum(by_group(state.high.price, state.low.price), axis=1) - state.slack.price, 0.0
-                )
-                eps_push = jnp.sum(by_group(push["high"], push["low"]), axis=1) + push["slack"] - eps_residual
-            rhs = -dual - row_push @ qp.theta
-            shifted = {
-                name: push[name] - weight[name] * primal[name] for name in ("box_low", "box_high", "row_low", "row_high")
-            }
-            rhs -= shifted["box_high"] - shifted["box_low"]
+            row_push = push["above"] - push["below"] - skew * eta_push + on_rows(push["high"] - push["low"])
+            shifted = layout.split(push_vector - weight * state.primal)
+            rhs = -state.dual - row_push @ qp.theta - shifted["box_high"] + shifted["box_low"]
             rhs -= (shifted["row_high"] - shifted["row_low"]) @ w_matrix
-            if qp.has_limits:
+            if groups:
+                eps_push = per_group(push["high"], push["low"]) + push["relief"] - eps_residual
                 rhs += (eps_push / eps_pivot) @ cross
-            rhs = jnp.where(free, rhs, 0.0)
-            dx = jacobi * jax.scipy.linalg.cho_solve((factor, True), jacobi * rhs)
-            dx = jnp.where(free, dx, 0.0)
+            dx = keep * jacobi * jax.scipy.linalg.cho_solve((factor, True), jacobi * keep * rhs)
             dt = qp.theta @ dx
-            deta = jnp.where(active_soft, eta_push / eta_pivot + skew * dt, 0.0)
-            dslack = {"above": deta - dt, "below": deta + dt, "beyond": deta}
-            if qp.has_limits:
-                deps = jnp.where(masks["slack"], (eps_push + cross @ dx) / eps_pivot, 0.0)
-                deps_rows = jnp.repeat(deps, groups[1])
-                dslack |= {
-                    "high": deps_rows[:predictions] - predictions_of(dt),
-                    "low": deps_rows[predictions:] + predictions_of(dt),
-                    "slack": deps,
-                }
-            else:
-                deps = jnp.zeros(0)
-                dslack |= dict.fromkeys(("high", "low", "slack"), jnp.zeros(0))
+            deta = finite(eta_push / eta_pivot + skew * dt, soft)
+            deps = finite((eps_push + cross @ dx) / eps_pivot, relief_on) if groups else state.eps
+            deps_high, deps_low = per_prediction(deps)
             dwx = w_matrix @ dx
-            dslack |= {
-                "box_low": dx + primal["box_low"],
-                "box_high": -dx + primal["box_high"],
-                "row_low": dwx + primal["row_low"],
-                "row_high": -dwx + primal["row_high"],
-            }
-            dslack = {name: jnp.where(masks[name], value, 0.0) for name, value in dslack.items()}
-            dprice = {name: push[name] - weight[name] * dslack[name] for name in FAMILIES}
-            return dx, deta, deps, dslack, dprice
+            dslack = layout.join(
+                {
+                    "above": deta - dt,
+                    "below": deta + dt,
+                    "beyond": deta,
+                    "high": deps_high - dt[:predictions],
+                    "low": deps_low + dt[:predictions],
+                    "relief": deps,
+                    "box_low": dx,
+                    "box_high": -dx,
+                    "row_low": dwx,
+                    "row_high": -dwx,
+                }
+            )
+            dslack = finite(dslack + state.primal, mask)
+            return dx, dt, deta, deps, dslack, push_vector - weight * dslack
 
         def longest(dslack, dprice):
-            ratio = jnp.zeros(())
-            for name in FAMILIES:
-                family = getattr(state, name)
-                if family.slack.shape[0]:
-                    ratio = jnp.maximum(ratio, jnp.max(-dslack[name] / family.slack))
-                    ratio = jnp.maximum(ratio, jnp.max(jnp.where(masks[name], -dprice[name] / jnp.maximum(family.price, TINY), 0.0)))
-            return 1.0 / jnp.maximum(ratio, TINY)
+            shrink = jnp.maximum(-dslack / state.slack, finite(-dprice / jnp.maximum(state.price, TINY), mask))
+            return 1.0 / jnp.maximum(jnp.max(shrink), TINY)
 
-        zero = {name: jnp.zeros_like(getattr(state, name).slack) for name in FAMILIES}
-        _, _, _, dslack, dprice = direction(zero)
+        *_, dslack, dprice = direction(jnp.zeros_like(state.slack))
         alpha = jnp.minimum(longest(dslack, dprice), 1.0)
-        affine = sum(
-            jnp.sum(
-                jnp.where(
-                    masks[name],
-                    (getattr(state, name).slack + alpha * dslack[name]) * (getattr(state, name).price + alpha * dprice[name]),
-                    0.0,
-                )
-            )
-            for name in FAMILIES
-        )
+        affine = jnp.sum((state.slack + alpha * dslack) * (state.price + alpha * dprice))
         sigma = jnp.clip(affine / jnp.maximum(gap, TINY), 0.0, 1.0) ** 3
-        target = {name: sigma * mu - dslack[name] * dprice[name] for name in FAMILIES}
-        dx, deta, deps, dslack, dprice = direction(target)
-        alpha = jnp.minimum(0.995 * longest(dslack, dprice), 1.0)
-        moved = {
-            name: _Rows(
-                jnp.maximum(getattr(state, name).slack + alpha * dslack[name], TINY),
-                jnp.maximum(getattr(state, name).price + alpha * dprice[name], 0.0),
-            )
-            for name in FAMILIES
-        }
-        finite = jnp.all(jnp.isfinite(dx)) & jnp.isfinite(alpha)
+        dx, dt, deta, deps, dslack, dprice = direction(sigma * mu - dslack * dprice)
+        alpha = jnp.minimum(STEP * longest(dslack, dprice), 1.0)
+        moved = jnp.all(jnp.isfinite(dx)) & jnp.isfinite(alpha)
+        x, t = state.x + alpha * dx, state.t + alpha * dt
+        slack = jnp.maximum(state.slack + alpha * dslack, TINY)
+        price = jnp.maximum(state.price + alpha * dprice, 0.0)
+        primal, dual = (1.0 - alpha) * state.primal, dual_residual(x, price)
+        gap = jnp.sum(slack * price) / jnp.maximum(worth_of(x, t), LEAST_WORTH)
+        worst = jnp.maximum(jnp.maximum(jnp.max(jnp.abs(dual)), jnp.max(jnp.abs(primal))), gap)
+        better = worst < 0.9 * state.best
         after = _State(
-            x=state.x + alpha * dx,
+            x=x,
+            t=t,
             eps=state.eps + alpha * deps,
             eta=state.eta + alpha * deta,
+            slack=slack,
+            price=price,
+            primal=primal,
+            dual=dual,
             iterations=state.iterations + 1,
-            residual=state.residual,
-            best=state.best,
-            stalled=state.stalled,
-            **moved,
-        )
-        after = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, state)
-        dual, primal = residuals(after)
-        worst = jnp.max(jnp.abs(dual))
-        for value in primal.values():
-            if value.shape[0]:
-                worst = jnp.maximum(worst, jnp.max(jnp.abs(value)))
-        gap = sum(jnp.sum(jnp.where(masks[name], getattr(after, name).slack * getattr(after, name).price, 0.0)) for name in FAMILIES)
-        worth = jnp.abs(evaluate(qp, instance, after.x)) / scale
-        worst = jnp.maximum(worst, gap / jnp.maximum(worth, 1e-6))
-        better = worst < 0.9 * state.best
-        return after._replace(
-            iterations=jnp.where(finite, state.iterations + 1, MAX_ITERATIONS),
             residual=worst,
             best=jnp.where(better, worst, state.best),
             stalled=jnp.where(better, 0, state.stalled + 1),
         )
+        after = jax.tree.map(lambda new, old: jnp.where(moved, new, old), after, state)
+        return after._replace(iterations=jnp.where(moved, after.iterations, MAX_ITERATIONS))
 
     state = jax.lax.while_loop(
-        lambda s: (s.residual > TOLERANCE) & (s.iterations < MAX_ITERATIONS) & (s.stalled < 8), iterate, state
+        lambda s: (s.residual > TOLERANCE) & (s.iterations < MAX_ITERATIONS) & (s.stalled < PATIENCE), iterate, start
     )
-    x = jnp.clip(state.x, lower, upper)
-    x = jnp.where(free, x, fixed_value)
-    price = scale * (state.above.price - state.below.price)
-    high, low = scale * state.high.price, scale * state.low.price
-    pair = lambda name: jnp.where(masks[name], scale * getattr(state, name).price, 0.0)  # noqa: E731
+    x = jnp.where(free, jnp.clip(state.x, lower, upper), fixed_value)
+    price = layout.split(unit * state.price)
     solution = QpSolution(
         x=x,
         objective=evaluate(qp, instance, x),
         bound=jnp.asarray(-jnp.inf),
-        status=jnp.where(state.residual <= 1e-6, OPTIMAL, FAILED),
+        status=jnp.where(state.residual <= ACCEPTABLE, OPTIMAL, FAILED),
         iterations=state.iterations,
-        row_price=price,
-        limit_price=jnp.zeros(predictions),
-        lower_price=pair("box_low"),
-        upper_price=pair("box_high"),
-        row_low_price=pair("row_low"),
-        row_high_price=pair("row_high"),
+        row_price=price["above"] - price["below"],
+        limit_price=jnp.zeros(all_predictions),
+        lower_price=price["box_low"],
+        upper_price=price["box_high"],
+        row_low_price=price["row_low"],
+        row_high_price=price["row_high"],
         residual=state.residual,
     )
-    return _dual_bound(qp, w_matrix, instance, solution, lower, upper, high, low)
+    return _dual_bound(qp, w_matrix, instance, solution, lower, upper, price["high"], price["low"])
 
 
 def _dual_bound(qp, w_matrix, instance, solution, lower, upper, high, low):

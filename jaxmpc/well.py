@@ -2,8 +2,8 @@
 
 It stands in for the proprietary simulator of the thesis (3.2). The model follows the published line of
 gas-lift models (annulus gas, tubing gas and liquid, valve equations: Eikrem, Aamo, Imsland and Foss;
-Jahanshahi and Skogestad; Krishnamoorthy et al.) with two tubing sections, phase slip, a near-well pressure and
-a drooping lift supply. `model` uses nothing but arithmetic and the two functions in `ops`, so that
+Jahanshahi and Skogestad; Krishnamoorthy et al.) with two tubing sections, phase slip, a near-well pressure
+and a drooping lift supply. `model` uses nothing but arithmetic and the two functions in `ops`, so that
 `jaxmpc.plant` runs it with `jax.numpy` and the FMU source is generated from it with SymPy.
 """
 
@@ -154,6 +154,11 @@ class WellParameters(eqx.Module):
 def model(ops, x: Sequence, u: Sequence, p) -> tuple[list, list]:
     """Time derivatives and measurements of the well.
 
+    Three terms keep it stable with steps of 1 s and physical from shut-in to full opening. Each is C1 and
+    exactly inactive in normal operation (2000 m3/h of lift and 2 % choke, or more): dissolved gas softens
+    nearly full sections (`live_oil_share`), two such sections equalise at a bounded rate (`equalising_rate`),
+    and the supply throttles back as the annulus fills (`trip_start`, `trip_end`).
+
     Args:
         ops: functions beyond arithmetic: ``sqrt(x)`` and ``positive(x)`` = max(x, 0).
         x: the eight states in the order and units of `STATES`.
@@ -174,9 +179,8 @@ def model(ops, x: Sequence, u: Sequence, p) -> tuple[list, list]:
     rho_s = STANDARD_PRESSURE * p.molar_mass / (GAS_CONSTANT * STANDARD_TEMPERATURE)
     friction = p.friction_factor * height / (2 * p.tubing_diameter * area * area)
 
-    def root(
-        d, width
-    ):  # one-way square root, (d^2 / (d^2 + width^2)^(3/4)) for d > 0: C1, nothing flows back
+    def root(d, width):
+        # One-way and C1: d^2 / (d^2 + width^2)^(3/4) for d > 0, which is sqrt(d) well above the width.
         s = ops.positive(d)
         s = s * s
         r = ops.sqrt(s + width * width)
@@ -227,9 +231,9 @@ def model(ops, x: Sequence, u: Sequence, p) -> tuple[list, list]:
     p_wh = p_2 - rho_2 * weight - friction / 2 * rho_2 * q_2 * q_2
     w_g2, w_l2 = phase_flows(m_g2, m_l2, space_2, q_2)
 
-    # inflow from the reservoir
-    drawdown = p_nw - p_bh
-    w_r = p.productivity * ops.positive(drawdown)
+    # inflow from the reservoir; without it the near-well zone returns to the reservoir's pressure
+    drawdown = ops.positive(p_nw - p_bh)
+    w_r = p.productivity * drawdown
     w_rg = p.gas_oil_ratio * rho_s / p.liquid_density * w_r
     dp_nw = (
         p.reservoir_pressure + BAR * offset - p_nw - p.near_well_resistance * drawdown
@@ -238,7 +242,7 @@ def model(ops, x: Sequence, u: Sequence, p) -> tuple[list, list]:
     # lift supply: droops with the annulus pressure
     s = (p_at - p.supply_pressure + p.supply_droop) / (2 * p.supply_droop)
     margin = ops.positive(p.supply_limit - p_at)
-    # A shut-in well would otherwise charge to the discharge pressure and blow down at ten times its usual rate.
+    # A shut-in well would otherwise charge to the discharge pressure, and blow down at ten times its rate.
     left, over = ops.positive(p.trip_end - p_at), ops.positive(p_at - p.trip_start)
     trip = left * left / (left * left + over * over)
     w_lift = (

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,12 +19,14 @@ import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
+from jaxmpc.closed_loop import simulate
+from jaxmpc.controller import ContinuousController, MixedIntegerController
 from jaxmpc.errors import InputError
 from jaxmpc.step_response import StepResponseModel
 from jaxmpc.trajectory import Trajectory
 from studies.definition import ComparisonDefinition, ControllerDefinition
 from studies.fingerprint import content_hash, source_hash, versions
-from studies.store import ResultStore, results_template
+from studies.store import FORMAT, ResultStore, results_template
 
 Say = Callable[[str], None]
 TUNING_AXES = {
@@ -76,7 +79,7 @@ def run_comparison(
         "code": code,
     }
     hashes = [content_hash(inputs, controller.resolved()) for controller in definition.controllers]
-    study_hash = content_hash(msgspec.to_builtins(definition), hashes)
+    study_hash = content_hash(FORMAT, msgspec.to_builtins(definition), hashes)
     store = ResultStore.begin(
         folder,
         [controller.name for controller in definition.controllers],
@@ -112,9 +115,6 @@ def run_controller(
         make_plant: the plant with a given actuator.
         progress: whether to show a bar with rate and time left.
     """
-    from jaxmpc.closed_loop import simulate
-    from jaxmpc.controller import ContinuousController, MixedIntegerController
-
     kind = MixedIntegerController if definition.kind == "mixed-integer" else ContinuousController
     controller = kind(definition.structure(), definition.build_tuning(), model)
     plant = make_plant(definition.actuator)
@@ -125,7 +125,8 @@ def run_controller(
 @contextlib.contextmanager
 def _bar(label: str, show: bool) -> Iterator[Callable[[int, int], None]]:
     """A progress callback ``(done, total)`` that shows samples, rate and time left."""
-    with tqdm(desc=label, unit="sample", disable=not show, dynamic_ncols=True, mininterval=0.5) as bar:
+    often = 0.5 if sys.stderr.isatty() else 10.0  # s; a log file needs no more
+    with tqdm(desc=label, unit=" samples", disable=not show, dynamic_ncols=True, mininterval=often) as bar:
 
         def report(done: int, total: int) -> None:
             bar.total = total

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
@@ -25,119 +29,136 @@ def completed(data: xr.Dataset) -> xr.Dataset:
     return data.isel(controller=rows)
 
 
+# key figure: (its axes beside the controller, unit, what it is)
+MEANINGS: dict[str, tuple[tuple[str, ...], str, str]] = {
+    "choke_travel": ((), "%", "sum of absolute choke moves, actual position"),
+    "choke_moves": ((), "1", "choke moves"),
+    "choke_reversals": ((), "1", "choke reversals over the whole run"),
+    "late_reversals": (("window",), "1", "choke reversals in the second half of each setpoint window"),
+    "late_reversals_near_closed": ((), "1", "those of them below 50 % choke, all windows"),
+    "mean_dwell": ((), "s", "mean time between successive choke moves"),
+    "shortest_dwell": ((), "s", "shortest time between successive choke moves"),
+    "lift_travel": ((), "m3/h", "sum of absolute moves of the lift"),
+    "mean_absolute_deviation": (("cv",), "cv_unit", "mean of the absolute deviation from the setpoint"),
+    "integral_absolute_error": (("cv",), "cv_unit s", "integral of the absolute deviation"),
+    "time_outside_deadzone": (("cv",), "s", "time with a deviation beyond the deadzone"),
+    "cv_violations": (("cv",), "samples", "samples with the CV outside its soft limits"),
+    "mv_violations": (("mv",), "samples", "samples with the MV outside its limits"),
+    "move_violations": (("mv",), "samples", "samples with a move outside its limits"),
+    "largest_mean_opening": ((), "%/sample", "largest windowed mean of the demanded choke moves"),
+    "mean_move_stops": ((), "1", "pauses of the opening under the mean-move limit"),
+    "openings_above_limit": ((), "1", "openings although the windowed mean was above its limit"),
+    "solve_time_median": ((), "s", "median time of one controller step"),
+    "solve_time_p99": ((), "s", "99th percentile of the time of one controller step"),
+    "solve_time_max": ((), "s", "longest controller step"),
+    "largest_gap": ((), "1", "largest relative gap"),
+    "not_optimal": ((), "samples", "samples whose solve did not end optimal"),
+    "fallbacks": ((), "samples", "samples with the MVs held for want of a plan"),
+    "wall_time": ((), "s", "time of the whole run"),
+}
+
+
 def key_figures(data: xr.Dataset) -> xr.Dataset:
-    """Key figures of every finished run, with units; definitions in `studies.kpi`.
+    """Key figures of every finished run, with units; formulas in `studies.kpi`.
 
     Args:
         data: results from `studies.store.open_results`.
 
     Returns:
-        Variables over ``controller`` and, where they have one, ``cv``, ``mv`` or ``window``.
+        The variables of `MEANINGS` over ``controller`` and some over ``cv``, ``mv`` or ``window``.
     """
     data = completed(data).load()
-    dt = sampling_interval(data)
     window = data.window.values
     windows = int(window.max()) + 1
     late = kpi.second_halves(window)
+    choke, lift = (list(data.mv.values).index(name) for name in (CHOKE, LIFT))
     rows = []
-    for name in data.controller.values:
-        run = data.sel(controller=name)
-        choke = run.position.sel(mv=CHOKE).values
-        first = run.demand.sel(mv=CHOKE).values[0] - run.move.sel(mv=CHOKE).values[0]
-        choke_move = kpi.moves_of(choke, first)
-        demand_move = run.move.sel(mv=CHOKE).values
-        y, r = run.measurement.values, run.setpoint.values
-        reversal = kpi.reversal_events(choke_move)
-        hunting = kpi.reversal_events(choke_move, segment=late)
-        mean_dwell, shortest_dwell = kpi.dwell(choke_move, dt)
-        times = kpi.solve_time_statistics(run.solve_time.values)
-        span = run.mean_move_window.item()
-        tolerance = {kind: ROUNDING * _span(run, kind) for kind in ("cv", "mv", "move")}
-        rows.append(
-            {
-                "choke_travel": ((), kpi.travel(choke_move), "%"),
-                "choke_moves": ((), kpi.move_count(choke_move), "1"),
-                "choke_reversals": ((), reversal.sum(), "1"),
-                "late_reversals": (("window",), kpi.count_by_segment(hunting, late, windows), "1"),
-                "late_reversals_near_closed": ((), (hunting & (choke < NEAR_CLOSED)).sum(), "1"),
-                "mean_dwell": ((), mean_dwell, "s"),
-                "shortest_dwell": ((), shortest_dwell, "s"),
-                "lift_travel": ((), kpi.travel(run.move.sel(mv=LIFT).values), "m3/h"),
-                "mean_absolute_deviation": (("cv",), kpi.mean_absolute_deviation(y, r), "cv_unit"),
-                "integral_absolute_error": (("cv",), kpi.integral_absolute_error(y, r, dt), "cv_unit s"),
-                "time_outside_deadzone": (
-                    ("cv",),
-                    kpi.time_outside_deadzone(y, r, run.tuning_deadzone.values, dt),
-                    "s",
-                ),
-                "cv_violations": (
-                    ("cv",),
-                    kpi.limit_violations(
-                        y, run.tuning_cv_low.values, run.tuning_cv_high.values, tolerance["cv"]
-                    ),
-                    "samples",
-                ),
-                "mv_violations": (
-                    ("mv",),
-                    kpi.limit_violations(
-                        run.position.values,
-                        run.tuning_mv_low.values,
-                        run.tuning_mv_high.values,
-                        tolerance["mv"],
-                    ),
-                    "samples",
-                ),
-                "move_violations": (
-                    ("mv",),
-                    kpi.limit_violations(
-                        run.move.values,
-                        run.tuning_move_low.values,
-                        run.tuning_move_high.values,
-                        tolerance["move"],
-                    ),
-                    "samples",
-                ),
-                "largest_mean_opening": ((), kpi.windowed_mean(demand_move, span).max(), "%/sample"),
-                "mean_move_stops": (
-                    (),
-                    kpi.mean_move_stops(demand_move, span, run.tuning_mean_move_limit.sel(mv=CHOKE).item()),
-                    "1",
-                ),
-                "openings_above_limit": (
-                    (),
-                    kpi.opening_above_limit(
-                        demand_move, span, run.tuning_mean_move_limit.sel(mv=CHOKE).item()
-                    ),
-                    "1",
-                ),
-                "solve_time_median": ((), times[0], "s"),
-                "solve_time_p99": ((), times[1], "s"),
-                "solve_time_max": ((), times[2], "s"),
-                "largest_gap": ((), kpi.largest_gap(run.gap.values), "1"),
-                "not_optimal": ((), (run.status.values != 0).sum(), "samples"),
-                "fallbacks": ((), (run.fallback.values != 0).sum(), "samples"),
-                "wall_time": ((), run.wall_time.item(), "s"),
-            }
+    for i in range(data.sizes["controller"]):
+        run = data.isel(controller=i)
+        arrays = {name: run[name].values for name in INPUTS}
+        row = _figures(
+            arrays, late, sampling_interval(data), windows, run.mean_move_window.item(), choke, lift
         )
+        rows.append(row | {"wall_time": run.wall_time.values})
     out = {}
-    for key, (dims, _, unit) in rows[0].items():
-        values = np.stack([np.asarray(row[key][1]) for row in rows])
-        out[key] = xr.DataArray(values, dims=("controller", *dims), attrs={"units": unit})
-    coords = {name: data[name] for name in ("controller", "label", "cv", "mv", "cv_unit", "mv_unit")}
+    for key, (axes, unit, meaning) in MEANINGS.items():
+        values = np.stack([np.asarray(row[key]) for row in rows])
+        out[key] = xr.DataArray(
+            values, dims=("controller", *axes), attrs={"units": unit, "long_name": meaning}
+        )
+    coords: dict = {name: data[name] for name in ("controller", "label", "cv", "mv", "cv_unit", "mv_unit")}
     starts = np.array([data.time.values[window == w][0] for w in range(windows)])
     coords["window"] = ("window", starts, {"long_name": "start of the setpoint window", "units": "s"})
     return xr.Dataset(out, coords)
 
 
+INPUTS = (
+    "measurement",
+    "setpoint",
+    "position",
+    "demand",
+    "move",
+    "solve_time",
+    "gap",
+    "status",
+    "fallback",
+    "tuning_deadzone",
+    "tuning_cv_low",
+    "tuning_cv_high",
+    "tuning_mv_low",
+    "tuning_mv_high",
+    "tuning_move_low",
+    "tuning_move_high",
+    "tuning_mean_move_limit",
+)
+
+
+@functools.partial(jax.jit, static_argnames=("windows", "span", "choke", "lift"))
+def _figures(run: dict, late, dt: float, windows: int, span: int, choke: int, lift: int) -> dict:
+    """The key figures of one run as arrays; `jax.vmap` over `run` does many."""
+    position, y, r = run["position"][:, choke], run["measurement"], run["setpoint"]
+    actual = kpi.moves_of(position, run["demand"][0, choke] - run["move"][0, choke])
+    demanded = run["move"][:, choke]
+    hunting = kpi.reversal_events(actual, segment=late)
+    mean_dwell, shortest_dwell = kpi.dwell(actual, dt)
+    times = kpi.solve_time_statistics(run["solve_time"])
+    limit = run["tuning_mean_move_limit"][choke]
+
+    def violations(value, kind):
+        low, high = run[f"tuning_{kind}_low"], run[f"tuning_{kind}_high"]
+        width = jnp.where(jnp.isfinite(high - low), high - low, 0.0)
+        return kpi.limit_violations(value, low, high, ROUNDING * width)
+
+    return {
+        "choke_travel": kpi.travel(actual),
+        "choke_moves": kpi.move_count(actual),
+        "choke_reversals": kpi.reversal_events(actual).sum(),
+        "late_reversals": kpi.count_by_segment(hunting, late, windows),
+        "late_reversals_near_closed": (hunting & (position < NEAR_CLOSED)).sum(),
+        "mean_dwell": mean_dwell,
+        "shortest_dwell": shortest_dwell,
+        "lift_travel": kpi.travel(run["move"][:, lift]),
+        "mean_absolute_deviation": kpi.mean_absolute_deviation(y, r),
+        "integral_absolute_error": kpi.integral_absolute_error(y, r, dt),
+        "time_outside_deadzone": kpi.time_outside_deadzone(y, r, run["tuning_deadzone"], dt),
+        "cv_violations": violations(y, "cv"),
+        "mv_violations": violations(run["position"], "mv"),
+        "move_violations": violations(run["move"], "move"),
+        "largest_mean_opening": kpi.windowed_mean(demanded, span).max(),
+        "mean_move_stops": kpi.mean_move_stops(demanded, span, limit),
+        "openings_above_limit": kpi.opening_above_limit(demanded, span, limit),
+        "solve_time_median": times[0],
+        "solve_time_p99": times[1],
+        "solve_time_max": times[2],
+        "largest_gap": kpi.largest_gap(run["gap"]),
+        "not_optimal": (run["status"] != 0).sum(),
+        "fallbacks": (run["fallback"] != 0).sum(),
+    }
+
+
 def sampling_interval(data: xr.Dataset) -> float:
     """Sampling interval of the results [s]."""
     return float(data.attrs["dt"])
-
-
-def _span(run: xr.Dataset, kind: str) -> np.ndarray:
-    """Distance between the limits of a kind, 0 where one is infinite."""
-    span = run[f"tuning_{kind}_high"].values - run[f"tuning_{kind}_low"].values
-    return np.where(np.isfinite(span), span, 0.0)
 
 
 def final_deviation(data: xr.Dataset, controller: str) -> np.ndarray:

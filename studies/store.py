@@ -235,8 +235,8 @@ class ResultStore:
                     for name, value in list(wanted.items()):
                         if value in hashes and bool(data.complete.values[hashes.index(value)]):
                             row = data.isel(controller=[hashes.index(value)])
-                            fields = [*VARIABLES, "wall_time"]
-                            self._write_region(name, row[fields].load().drop_vars(list(row.coords)))
+                            fields = {key: row[key].variable for key in [*VARIABLES, "wall_time"]}
+                            self._write_region(name, xr.Dataset(fields).load())
                             del wanted[name]
                             say(f"{name}: taken over from {older.name}.")
             except (InputError, KeyError, ValueError, OSError) as error:

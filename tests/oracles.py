@@ -567,11 +567,9 @@ def solve_scip(case: dict, time_s: float = 60.0, gap: float = 1e-7) -> Answer:
     return Answer("optimal" if done else "limit", polished.objective, bound, polished.moves)
 
 
-# ------------------------------------------------------------------------------------------------ the judgement
+# ---------------------------------------------------------------------------------------------- the judgement
 
-FEASIBLE = (
-    1e-7  # of `violation`: what float64 leaves over in sums of 200 moves is 1e-13; solvers stop at 1e-9
-)
+FEASIBLE = 1e-7  # of `violation`: sums of 200 moves lose 1e-13 in float64, solvers stop at 1e-9
 EXACT = 1e-6  # relative: the gap at which a plan counts as optimal; oracles agree with each other to 1e-7
 SAME = 1e-8  # relative: two float64 evaluations of one cost, that differ in the order of sums alone
 FLOOR = 1e-3  # costs below it are compared absolutely: random cases have costs of order 1 to 1000

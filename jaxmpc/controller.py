@@ -1,0 +1,353 @@
+"""Controllers (thesis 5.3, 6): `init` and `step(state, measurement, setpoint) -> (state, info)`.
+
+`ContinuousController` is pure JAX: jit it, vmap it, scan it. `MixedIntegerController` has the same interface on
+the host, because the integer search may call HiGHS. Both share prediction, bias and bookkeeping. A solve that
+gives no plan holds the MVs, and the info says so.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxmpc import qp as qp_solver
+from jaxmpc import status as codes
+from jaxmpc.blocking import block_members, hard_rows, moves_per_block, sample_moves
+from jaxmpc.condense import CondensedQp, condense, make_instance
+from jaxmpc.disturbance import filter_bias
+from jaxmpc.errors import InputError
+from jaxmpc.integer import FINISHES
+from jaxmpc.plan import Plan, Planner, check_match, check_vector
+from jaxmpc.step_response import StepResponseModel, advance_free_response, shift_free_response
+from jaxmpc.structure import Structure
+from jaxmpc.tuning import Tuning
+
+
+class ControllerState(eqx.Module):
+    """What a controller remembers from sample to sample.
+
+    Attributes:
+        base: CVs the run started from; predictions are deviations from them [CV unit].
+        future: effect of the moves made so far on max(Hp, N) samples from now on [CV unit].
+        bias: filtered output bias v(k|k).
+        bias_raw: output bias before the filter (2.31b).
+        mv: present demand [MV unit].
+        last_move: previous move [MV unit].
+        past_moves: the last `mean_move_window` moves, oldest first [MV unit].
+        plan: the previous plan shifted by one sample, block moves [MV unit].
+    """
+
+    base: Float[Array, " cv"]
+    future: Float[Array, "cv future"]
+    bias: Float[Array, " cv"]
+    bias_raw: Float[Array, " cv"]
+    mv: Float[Array, " mv"]
+    last_move: Float[Array, " mv"]
+    past_moves: Float[Array, "window mv"]
+    plan: Float[Array, "block mv"]
+
+
+class StepInfo(eqx.Module):
+    """What one controller step did.
+
+    Attributes:
+        move: applied move [MV unit].
+        mv: demand after it [MV unit].
+        moves: planned block moves [MV unit].
+        status: code of `jaxmpc.status`.
+        fallback: the MVs were held because there was no plan.
+        recovering: an MV was outside its limits and is being brought back.
+        objective, bound, gap: value of the plan (6.6), proven bound, relative gap; not a number without a plan.
+        nodes: relaxations solved (interior-point iterations of the one relaxation for continuous moves).
+        finished_by: code of `jaxmpc.status.FINISHERS`.
+        solve_time: wall time of the solve [s]; not a number inside a compiled loop, which has no clock.
+    """
+
+    move: Float[Array, " mv"]
+    mv: Float[Array, " mv"]
+    moves: Float[Array, "block mv"]
+    status: Int[Array, ""]
+    fallback: Bool[Array, ""]
+    recovering: Bool[Array, ""]
+    objective: Float[Array, ""]
+    bound: Float[Array, ""]
+    gap: Float[Array, ""]
+    nodes: Int[Array, ""]
+    finished_by: Int[Array, ""]
+    solve_time: Float[Array, ""]
+
+
+class _Memory(eqx.Module):
+    """Prediction and bookkeeping shared by the controllers."""
+
+    structure: Structure = eqx.field(static=True)
+    tuning: Tuning
+    coefficients: Float[Array, "cv mv future"]
+
+    def init(self, cv: Float[Array, " cv"], mv: Float[Array, " mv"]) -> ControllerState:
+        """State of a controller that starts in a steady state.
+
+        Args:
+            cv: measured CVs [CV unit].
+            mv: present MVs [MV unit].
+        """
+        s = self.structure
+        zeros = lambda *shape: jnp.zeros(shape)  # noqa: E731
+        return ControllerState(
+            base=jnp.asarray(cv, dtype=jnp.float64),
+            future=zeros(s.cv_count, self.coefficients.shape[-1]),
+            bias=zeros(s.cv_count),
+            bias_raw=zeros(s.cv_count),
+            mv=jnp.asarray(mv, dtype=jnp.float64),
+            last_move=zeros(s.mv_count),
+            past_moves=zeros(s.mean_move_window, s.mv_count),
+            plan=zeros(s.block_count, s.mv_count),
+        )
+
+    def observe(self, state: ControllerState, cv) -> tuple[ControllerState, Float[Array, "horizon cv"]]:
+        """Compare a measurement with its prediction, update the bias, and move on to the next sample.
+
+        Args:
+            state: from `init` or `remember`; its future starts at the present sample.
+            cv: measurement now [CV unit].
+
+        Returns:
+            ``(state, free_response)``: the future now starts at the next sample; Lambda (5.13) at j = 1..Hp.
+        """
+        raw = cv - (state.base + state.future[:, 0])  # (2.31b)
+        bias = filter_bias(state.bias, state.bias_raw, raw, self.tuning.bias_cutoff, self.structure.dt)
+        future = shift_free_response(state.future)
+        state = eqx.tree_at(lambda s: (s.bias, s.bias_raw, s.future), state, (bias, raw, future))
+        return state, state.base + future[:, : self.structure.prediction_horizon].T + bias
+
+    def remember(self, state: ControllerState, move, moves) -> ControllerState:
+        """Apply a move: predictions, history, and the plan shifted by one sample."""
+        return ControllerState(
+            base=state.base,
+            future=advance_free_response(state.future, self.coefficients, move),
+            bias=state.bias,
+            bias_raw=state.bias_raw,
+            mv=state.mv + move,
+            last_move=move,
+            past_moves=jnp.concatenate([state.past_moves[1:], move[None]]),
+            plan=shift_plan(self.structure, moves),
+        )
+
+
+def shift_plan(structure: Structure, moves: Float[Array, "block mv"]) -> Float[Array, "block mv"]:
+    """The plan one sample later, in blocks again: the rest of the moves, and none at the end."""
+    samples = jnp.asarray(sample_moves(structure)) @ moves
+    later = jnp.concatenate([samples[1:], jnp.zeros((1, structure.mv_count))])
+    sums = jnp.asarray(block_members(structure)).T @ later
+    return sums / jnp.asarray(moves_per_block(structure))[:, None]
+
+
+def outside_limits(tuning: Tuning, mv: Float[Array, " mv"]) -> Bool[Array, ""]:
+    """Whether any MV is outside its limits by more than rounding."""
+    drift = 1e-6 * jnp.maximum(1.0, jnp.abs(mv))
+    return jnp.any((mv < tuning.mv_low - drift) | (mv > tuning.mv_high + drift))
+
+
+class ContinuousController(eqx.Module):
+    """MPC with continuous moves (thesis chapter 5 with 6.2-6.4, 6.6); pure, so that it can be jitted, vmapped, scanned.
+
+    Args:
+        structure: static configuration without integer MVs.
+        tuning: weights and limits; batch its fields to batch controllers.
+        model: step-response model.
+        packed: keep the packed products of the dynamic matrix; pays for batches of 16 or more that share it.
+    """
+
+    memory: _Memory
+    qp: CondensedQp
+
+    def __init__(self, structure: Structure, tuning: Tuning, model: StepResponseModel, *, packed: bool = False):
+        if structure.integer_mvs:
+            raise InputError(
+                "structure.integer_step",
+                list(structure.integer_step),
+                "no integer MVs for a continuous controller",
+                "Use MixedIntegerController, or structure.relaxed()",
+            )
+        check_match(structure, model)
+        self.memory = _Memory(structure, tuning, model.extended(max(structure.prediction_horizon, model.samples)))
+        self.qp = condense(structure, tuning, model.coefficients, envelope=0, packed=packed)
+
+    @property
+    def structure(self) -> Structure:
+        """Static configuration."""
+        return self.memory.structure
+
+    @property
+    def tuning(self) -> Tuning:
+        """Weights and limits."""
+        return self.memory.tuning
+
+    def init(self, cv: Float[Array, " cv"], mv: Float[Array, " mv"]) -> ControllerState:
+        """State at a steady state with measured CVs and present MVs (engineering units)."""
+        return self.memory.init(cv, mv)
+
+    def step(
+        self, state: ControllerState, cv: Float[Array, " cv"], setpoint: Float[Array, " cv"]
+    ) -> tuple[ControllerState, StepInfo]:
+        """One sample.
+
+        Args:
+            state: from `init` or the previous step.
+            cv: measurement now [CV unit].
+            setpoint: held over the horizon [CV unit].
+        """
+        structure, tuning = self.structure, self.tuning
+        state, free_response = self.memory.observe(state, cv)
+        instance = make_instance(
+            structure,
+            tuning,
+            self.qp,
+            free_response=free_response,
+            setpoint=jnp.broadcast_to(setpoint, free_response.shape),
+            mv_now=state.mv,
+            last_move=state.last_move,
+            past_moves=state.past_moves,
+            recover=True,
+        )
+        solution = qp_solver.solve(self.qp, hard_rows(structure), instance, instance.lower, instance.upper)
+        moves = (solution.x * self.qp.scale).reshape(structure.mv_count, -1).T
+        objective = solution.objective
+        bound = jnp.minimum(jnp.maximum(solution.bound, 0.0), objective)
+        scale = jnp.maximum(jnp.abs(objective), 1e-6 * jnp.max(jnp.diagonal(self.qp.curvature)))
+        gap = (objective - bound) / scale
+        good = (solution.status == codes.OPTIMAL) & jnp.all(jnp.isfinite(moves)) & jnp.all(jnp.isfinite(cv))
+        # solver tolerance must not leave the limits: the applied move is cut to what the first block may do
+        blocks = structure.block_count
+        unit = self.qp.scale[::blocks]
+        low, high = instance.lower[::blocks], instance.upper[::blocks]
+        first = np.array([np.flatnonzero(hard_rows(structure)[:, mv * blocks])[0] for mv in range(structure.mv_count)])
+        end_low, end_high = instance.row_low[first], instance.row_high[first]
+        held = moves_per_block(structure)[0]
+        move = jnp.clip(moves[0] / unit, jnp.maximum(low, end_low / held), jnp.minimum(high, end_high / held)) * unit
+        move = jnp.where(good, move, 0.0)
+        moves = jnp.where(good, moves, 0.0)
+        recovering = outside_limits(tuning, state.mv)
+        state = self.memory.remember(state, move, moves)
+        missing = lambda value: jnp.where(good, value, jnp.nan)  # noqa: E731
+        info = StepInfo(
+            move=move,
+            mv=state.mv,
+            moves=moves,
+            status=jnp.where(good, codes.OPTIMAL, codes.FAILED),
+            fallback=~good,
+            recovering=recovering,
+            objective=missing(objective),
+            bound=missing(bound),
+            gap=missing(gap),
+            nodes=solution.iterations,
+            finished_by=jnp.where(good, codes.finisher_code("relaxation"), 0),
+            solve_time=jnp.asarray(jnp.nan),
+        )
+        return state, info
+
+
+class MixedIntegerController:
+    """MPC with whole moves of the integer MVs (thesis chapter 6); runs on the host, solves exactly.
+
+    Args:
+        structure: static configuration with at least one integer MV.
+        tuning: weights and limits.
+        model: step-response model.
+        gap: relative gap of a solve.
+        time_limit: seconds per solve, None for none.
+        finish: path that closes the integer problem, see `jaxmpc.integer`.
+    """
+
+    def __init__(
+        self,
+        structure: Structure,
+        tuning: Tuning,
+        model: StepResponseModel,
+        *,
+        gap: float = 1e-6,
+        time_limit: float | None = None,
+        finish: str = "auto",
+    ):
+        if not structure.integer_mvs:
+            raise InputError(
+                "structure.integer_step",
+                list(structure.integer_step),
+                "at least one integer MV",
+                "Use ContinuousController for continuous moves",
+            )
+        if finish not in FINISHES:
+            raise InputError("finish", finish, f"one of {', '.join(FINISHES)}")
+        self.planner = Planner(structure, tuning, model)
+        self.memory = _Memory(structure, tuning, model.extended(max(structure.prediction_horizon, model.samples)))
+        self.gap, self.time_limit, self.finish = gap, time_limit, finish
+
+    @property
+    def structure(self) -> Structure:
+        """Static configuration."""
+        return self.memory.structure
+
+    @property
+    def tuning(self) -> Tuning:
+        """Weights and limits."""
+        return self.memory.tuning
+
+    def init(self, cv, mv) -> ControllerState:
+        """State at a steady state with measured CVs and present MVs (engineering units)."""
+        check_vector("cv", cv, self.structure.cv_names, "CV unit")
+        check_vector("mv", mv, self.structure.mv_names, "MV unit")
+        return self.memory.init(cv, mv)
+
+    def step(self, state: ControllerState, cv, setpoint) -> tuple[ControllerState, StepInfo]:
+        """One sample; arguments as in `ContinuousController.step`."""
+        state, free_response = _observe(self.memory, state, jnp.asarray(cv))
+        if not np.isfinite(np.asarray(cv)).all():
+            return self._after(state, None)
+        plan = self.planner.solve(
+            mv_now=state.mv,
+            last_move=state.last_move,
+            free_response=free_response,
+            setpoint=np.broadcast_to(np.asarray(setpoint, dtype=np.float64), free_response.shape),
+            previous_moves=state.plan,
+            past_moves=state.past_moves,
+            recover=True,
+            time_limit=self.time_limit,
+            gap=self.gap,
+            finish=self.finish,
+        )
+        return self._after(state, plan)
+
+    def _after(self, state: ControllerState, plan: Plan | None) -> tuple[ControllerState, StepInfo]:
+        good = plan is not None and plan.moves is not None
+        moves = plan.moves if plan is not None and plan.moves is not None else np.zeros_like(np.asarray(state.plan))
+        recovering = bool(outside_limits(self.tuning, state.mv))
+        state = _remember(self.memory, state, jnp.asarray(moves[0]), jnp.asarray(moves))
+        number = lambda value: np.float64(np.nan if value is None else value)  # noqa: E731
+        info = StepInfo(
+            move=moves[0],
+            mv=np.asarray(state.mv),
+            moves=moves,
+            status=np.int64(codes.STATUS.index(plan.status) if plan is not None else codes.FAILED),
+            fallback=np.bool_(not good),
+            recovering=np.bool_(recovering),
+            objective=number(plan.objective if plan else None),
+            bound=number(plan.bound if plan else None),
+            gap=number(plan.gap if plan else None),
+            nodes=np.int64(plan.nodes if plan else 0),
+            finished_by=np.int64(codes.finisher_code(plan.finished_by if plan else None)),
+            solve_time=number(plan.solve_time_s if plan else None),
+        )
+        return state, info
+
+
+@eqx.filter_jit
+def _observe(memory: _Memory, state: ControllerState, cv):
+    return memory.observe(state, cv)
+
+
+@eqx.filter_jit
+def _remember(memory: _Memory, state: ControllerState, move, moves):
+    return memory.remember(state, move, moves)

@@ -1,0 +1,111 @@
+"""Made-up closed loops of the thesis's shape, to test stores, key figures and plots without solving."""
+
+import numpy as np
+import xarray as xr
+
+from jaxmpc.step_response import make_model
+from jaxmpc.trajectory import Trajectory
+from studies.comparison import comparison_template
+from studies.definition import ComparisonDefinition, ReferenceDefinition
+from studies.thesis import CONTROLLERS
+
+DT = 10.0
+REFERENCE = ReferenceDefinition((0.0, 2000.0), ((10_000.0, 150.0), (30_000.0, 300.0)), 4000.0)
+
+
+def definition(**changes) -> ComparisonDefinition:
+    """Two windows of 200 samples: one setpoint pair within reach of the map, one far outside."""
+    fields = {
+        "name": "made-up",
+        "title": "Made-up comparison",
+        "plant": "jax",
+        "controllers": CONTROLLERS,
+        "reference": REFERENCE,
+    }
+    return ComparisonDefinition(**{**fields, **changes})
+
+
+def model():
+    """A ramp of four coefficients per response."""
+    ramp = np.tile(np.arange(1.0, 5.0), (2, 2, 1))
+    return make_model(
+        ramp,
+        DT,
+        ("gas_rate", "oil_rate"),
+        ("choke", "gas_lift"),
+        cv_units=("m3/h",) * 2,
+        mv_units=("%", "m3/h"),
+    )
+
+
+def extra() -> dict[str, xr.DataArray]:
+    """A plant whose steady gas is 100 times and whose oil is 1.5 times the choke, whatever the lift."""
+    choke, lift = np.linspace(0, 100, 11), np.array([0.0, 10_000.0])
+    rate = np.stack([np.tile(100 * choke, (2, 1)), np.tile(1.5 * choke, (2, 1))])
+    sweep = np.ones((2, 3, 5)) * np.arange(5.0, 0.0, -1.0)
+    return {
+        "map_rate": xr.DataArray(
+            rate, dims=("cv", "map_lift", "map_choke"), coords={"map_lift": lift, "map_choke": choke}
+        ),
+        "sweep_coefficient": xr.DataArray(
+            sweep,
+            dims=("cv", "sweep_lift", "sweep_choke"),
+            coords={"sweep_lift": [5000.0, 7500.0, 10_000.0], "sweep_choke": np.linspace(10, 90, 5)},
+        ),
+    }
+
+
+def template(
+    study_hash="study", hashes=("a", "b", "c"), of: ComparisonDefinition | None = None
+) -> xr.Dataset:
+    """The results before any run."""
+    return comparison_template(
+        of or definition(), model(), extra(), list(hashes), study_hash, {"kind": "jax"}, {"jaxmpc": "none"}
+    )
+
+
+def trajectory(kind: str, samples: int = 400) -> Trajectory:
+    """A run in which the choke rises in a staircase to 40 %, then holds (`smooth`), swings by 2 % every ten
+    samples (`hunting`), or creeps (`creeping`)."""
+    k = np.arange(samples)
+    reference = REFERENCE.build()
+    setpoint = reference.sample(DT, samples)
+    move = np.zeros(samples)
+    move[:20:2] = 2.0  # 20 % in ten moves: the windowed mean passes 0.55 with the seventh
+    position = 20 + np.cumsum(move)
+    demand = position.copy()
+    if kind == "hunting":
+        position = position + 2.0 * ((k // 10) % 2) * (k >= 20)
+        demand = demand + np.sin(k / 3) * (k >= 20)
+    if kind == "creeping":
+        demand = position = position + 0.001 * np.sin(k)
+    lift = np.full(samples, 7500.0)
+    mv_demand = np.stack([demand, lift], axis=1)
+    cv = setpoint + np.stack([10 * np.cos(k / 5), np.cos(k / 5)], axis=1)
+    cv[setpoint[:, 0] > 20_000] = (15_000.0, 250.0)
+    return Trajectory(
+        time=DT * k,
+        setpoint=setpoint,
+        cv=cv,
+        mv_demand=mv_demand,
+        mv=np.stack([position, lift], axis=1),
+        move=np.diff(mv_demand, axis=0, prepend=[[20.0, 7500.0]]),
+        bias=cv / 10,
+        bias_raw=cv / 9,
+        status=np.zeros(samples, dtype=int),
+        fallback=np.zeros(samples, dtype=bool),
+        objective=np.ones(samples),
+        bound=np.ones(samples),
+        gap=np.zeros(samples),
+        nodes=np.ones(samples, dtype=int),
+        solve_time=np.linspace(1e-3, 2e-3, samples),
+        finished_by=np.ones(samples, dtype=int),
+        cv_names=("gas_rate", "oil_rate"),
+        mv_names=("choke", "gas_lift"),
+        cv_units=("m3/h", "m3/h"),
+        mv_units=("%", "m3/h"),
+        dt=DT,
+    )
+
+
+RUNS = {"continuous-choke": "creeping", "step-choke": "hunting", "mixed-integer": "smooth"}

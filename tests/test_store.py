@@ -1,0 +1,160 @@
+"""The results store: labelled, never half written, never overwritten by another question."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from jaxmpc.errors import InputError
+from studies import store
+from studies.store import ResultStore, open_results
+from tests import studies_synthetic as made
+
+NAMES = [controller.name for controller in made.CONTROLLERS]
+
+
+def begin(folder, study_hash="study", hashes=("a", "b", "c"), lines=None):
+    say = lines.append if lines is not None else (lambda line: None)
+    return ResultStore.begin(folder, NAMES, study_hash, lambda: made.template(study_hash, hashes), say)
+
+
+def test_what_is_written_is_read_back_with_names_and_units(tmp_path):
+    written = made.trajectory("hunting")
+    begin(tmp_path).write("step-choke", written, wall_time=1.5)
+    data = open_results(tmp_path)
+    run = data.sel(controller="step-choke")
+    np.testing.assert_array_equal(run.measurement.sel(cv="oil_rate"), written.cv[:, 1])
+    np.testing.assert_array_equal(run.position.sel(mv="choke"), written.mv[:, 0])
+    np.testing.assert_array_equal(run.fallback, 0)
+    assert run.complete == 1
+    assert data.time.attrs["units"] == "s"
+    assert data.mv_unit.sel(mv="choke").item() == "%"
+    assert data.solve_time.attrs == {"long_name": "time of one controller step", "units": "s"}
+    assert float(run.tuning_deadzone.sel(cv="oil_rate")) == 5.0
+    assert store.provenance(data, "definition")["name"] == "made-up"
+    assert store.provenance(data, "versions")["python"]
+
+
+def test_a_run_that_is_not_there_reads_as_empty_and_incomplete(tmp_path):
+    begin(tmp_path).write("step-choke", made.trajectory("hunting"), 1.0)
+    run = open_results(tmp_path).sel(controller="mixed-integer")
+    assert run.complete == 0
+    assert np.isnan(run.measurement).all()
+    assert (run.status == -1).all()
+
+
+def test_a_second_begin_with_the_same_hash_keeps_everything_and_makes_no_template(tmp_path):
+    begin(tmp_path).write("mixed-integer", made.trajectory("smooth"), 1.0)
+
+    def fail():
+        raise AssertionError("the template is not needed")
+
+    again = ResultStore.begin(tmp_path, NAMES, "study", fail)
+    assert [again.complete(name) for name in NAMES] == [False, False, True]
+
+
+def test_results_of_another_study_are_set_aside_and_unchanged_runs_taken_over(tmp_path):
+    first = begin(tmp_path)
+    first.write("continuous-choke", made.trajectory("smooth"), 1.0)
+    first.write("mixed-integer", made.trajectory("creeping"), 2.0)
+    lines = []
+    second = begin(tmp_path, "changed", ("a", "b", "new"), lines)
+    assert [second.complete(name) for name in NAMES] == [True, False, False]
+    kept = tmp_path / "results-study.zarr"
+    assert open_results(kept).sel(controller="mixed-integer").complete == 1
+    xr.testing.assert_equal(
+        open_results(kept).measurement.sel(controller="continuous-choke").load(),
+        open_results(tmp_path).measurement.sel(controller="continuous-choke").load(),
+    )
+    assert any("results-study.zarr" in line for line in lines)
+    # and back again: everything that was computed is still there
+    third = begin(tmp_path, "study")
+    assert [third.complete(name) for name in NAMES] == [True, False, True]
+
+
+def test_a_damaged_store_is_set_aside_and_named(tmp_path):
+    begin(tmp_path).write("step-choke", made.trajectory("hunting"), 1.0)
+    (tmp_path / store.RESULTS / "zarr.json").write_text("{ damaged")
+    lines = []
+    again = begin(tmp_path, lines=lines)
+    assert not again.complete("step-choke")
+    assert (tmp_path / "results-unreadable.zarr").exists()
+    assert any("results-unreadable.zarr" in line for line in lines)
+
+
+def test_a_run_killed_while_it_writes_leaves_no_finished_run(tmp_path):
+    script = """
+        import os, signal, sys
+        from pathlib import Path
+        import xarray as xr
+        from tests import test_store as t
+        from tests import studies_synthetic as made
+        store = t.begin(Path(sys.argv[1]))
+        store.write("continuous-choke", made.trajectory("smooth"), 1.0)
+        write = xr.Dataset.to_zarr
+        def dying(self, *a, **k):
+            if "complete" in self and "measurement" not in self:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return write(self, *a, **k)
+        xr.Dataset.to_zarr = dying
+        store.write("step-choke", made.trajectory("hunting"), 1.0)
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script), str(tmp_path)],
+        cwd=Path(__file__).parents[1],
+        check=False,
+    )
+    assert done.returncode == -signal.SIGKILL
+    again = begin(tmp_path)
+    assert [again.complete(name) for name in NAMES] == [True, False, False]
+    again.write("step-choke", made.trajectory("hunting"), 1.0)
+    assert again.complete("step-choke")
+
+
+def test_remains_of_a_store_that_was_being_made_are_removed(tmp_path):
+    (tmp_path / ".new-results-abc" / "results.zarr").mkdir(parents=True)
+    begin(tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["results.zarr"]
+
+
+def test_missing_results_say_what_to_do(tmp_path):
+    with pytest.raises(InputError, match="Run the study first"):
+        open_results(tmp_path)
+
+
+def test_two_runs_on_one_folder_are_refused(tmp_path):
+    with (
+        store.locked(tmp_path),
+        pytest.raises(InputError, match="no other run"),
+        store.locked(tmp_path),
+    ):
+        pass
+    with store.locked(tmp_path):
+        pass
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_permission_is_refused(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(InputError, match="can be written"):
+        store.check_writable(tmp_path / "results")
+
+
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
+    (tmp_path / "results").write_text("in the way")
+    with pytest.raises(InputError, match=r"out.*can be written"):
+        store.check_writable(tmp_path / "results" / "thesis")
+
+
+def test_the_store_is_plain_zarr_with_json_metadata(tmp_path):
+    begin(tmp_path)
+    body = json.loads((tmp_path / store.RESULTS / "zarr.json").read_text())
+    assert body["zarr_format"] == 3
+    assert body["attributes"]["format"] == store.FORMAT
