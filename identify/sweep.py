@@ -74,8 +74,8 @@ def stability_map(parameters: WellParameters | None = None, chokes=None, lifts=N
     """Where the well oscillates, and whether an oscillation grows (casing heading, thesis 6.7).
 
     The shipped well has no growing oscillation. After a disturbance it swings back: from 2000 m3/h of lift on
-    the least damping ratio is 0.54, and it falls to 0.41 at 500 m3/h with the choke fully open, where one swing
-    takes 44 minutes and the slowest mode 15.
+    the least damping ratio is 0.55, and it falls to 0.41 at 500 m3/h with the choke fully open, where one
+    swing takes 44 minutes.
 
     Args:
         parameters: of the well; the shipped ones by default.

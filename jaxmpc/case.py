@@ -19,6 +19,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from jaxmpc.condense import DRIFT
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
 from jaxmpc.step_response import StepResponseModel, make_model
@@ -26,9 +27,6 @@ from jaxmpc.structure import Structure
 from jaxmpc.tuning import UNITS, Tuning, make_tuning
 
 DEFAULT_GAP = 1e-6
-ROUNDING = (
-    1e-6  # how far `mv_now` may lie outside a limit, relative to max(1, |limit|): what MIP solvers leave over
-)
 LONGEST_HORIZON = 100_000  # samples; beyond it the file is wrong, and memory runs out before any other check
 
 
@@ -404,10 +402,8 @@ def _check_position(case: Case) -> None:
     """Refuse MVs outside their limits: the closed-loop controller recovers, a single step cannot."""
     low, high = np.asarray(case.tuning.mv_low), np.asarray(case.tuning.mv_high)
     for i, name in enumerate(case.structure.mv_names):
-        for limit, excess in ((low[i], low[i] - case.mv_now[i]), (high[i], case.mv_now[i] - high[i])):
-            if excess > ROUNDING * max(1.0, abs(limit)):
-                raise InputError(
-                    f"mv_now[{i}]",
-                    float(case.mv_now[i]),
-                    f"mv_low[{i}] = {low[i]:g} to mv_high[{i}] = {high[i]:g} [MV unit] for {name}",
-                )
+        now = float(case.mv_now[i])
+        drift = DRIFT * (case.structure.integer_step[i] or max(1.0, abs(now)))  # what MIP solvers leave over
+        if not low[i] - drift <= now <= high[i] + drift:
+            expected = f"mv_low[{i}] = {low[i]:g} to mv_high[{i}] = {high[i]:g} [MV unit] for {name}"
+            raise InputError(f"mv_now[{i}]", now, expected)

@@ -241,8 +241,10 @@ def make_instance(
             own_low = own_low.at[0].set(jnp.where(mean < -limit, jnp.maximum(own_low[0], jnp.minimum(own_high[0], 0.0)), own_low[0]))
         ends_low, ends_high = jnp.full(blocks, room_down), jnp.full(blocks, room_up)
         if recover:
-            ends_low = jnp.minimum(ends_low, _fastest_return(own_high, watch, held, counts, sign=1.0))
-            ends_high = jnp.maximum(ends_high, _fastest_return(own_low, watch, held, counts, sign=-1.0))
+            back_up = _fastest_return(own_high, watch, held, counts, sign=1.0)
+            back_down = _fastest_return(own_low, watch, held, counts, sign=-1.0)
+            ends_low = jnp.where(room_down > 0, jnp.minimum(ends_low, back_up), ends_low)
+            ends_high = jnp.where(room_up < 0, jnp.maximum(ends_high, back_down), ends_high)
         # a range that follows from the MV limits keeps every box finite where the limits are
         implied_low, implied_high = _implied_range(ends_low, ends_high, counts, integer)
         own_low, own_high = jnp.maximum(own_low, implied_low), jnp.minimum(own_high, implied_high)
@@ -256,9 +258,9 @@ def make_instance(
             row_high.append(width)
         windows = window_rows(structure)
         if len(windows):
-            budget = _window_budget(structure, tuning, past_moves, mv) / unit
-            row_low.append(-budget[1])
-            row_high.append(budget[0])
+            budget_up, budget_down = _window_budget(structure, tuning, past_moves, mv)
+            row_low.append(-budget_down / unit)
+            row_high.append(budget_up / unit)
     return QpInstance(
         offset=jnp.concatenate([spread(free_response) - target, jnp.zeros(extra)]),
         limit_high=per_cv(tuning.cv_high) - target,

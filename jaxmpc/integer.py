@@ -26,10 +26,10 @@ from jaxmpc.propagation import Chain, chains_of, nearest, propagate, satisfied
 from jaxmpc.status import FAILED, INFEASIBLE, LIMIT, OPTIMAL
 from jaxmpc.structure import Structure
 
-BATCHES = (1, 4, 16, 64)  # lanes of a relaxation call; one compilation each
-LEAN = 4  # lanes up to which the packed Gram matrix is left out
-FEW = 48  # combinations that are enumerated rather than searched
-HIGHS_SECONDS = 0.25  # what the reduced MILP may take before branch and bound closes the rest
+BATCH = 16  # lanes of a batched relaxation call; fewer than `SINGLE` problems are solved one by one
+SINGLE = 4
+FEW = 128  # combinations that are enumerated rather than searched
+HIGHS_SECONDS = 0.1  # what the reduced MILP may take before branch and bound closes the rest
 FINISHES = ("auto", "enumeration", "highs", "branch-and-bound")
 
 
@@ -137,15 +137,15 @@ class Search:
 
     # ---- batched relaxations
     def relax(self, lower: np.ndarray, upper: np.ndarray) -> Relaxations:
-        """Solve relaxed problems with integer limits ``"batch integer"``, in padded batches of fixed sizes."""
+        """Solve relaxed problems with integer limits ``"batch integer"``, one by one or in padded batches of one size."""
         count, parts = len(lower), []
         wide_low, wide_high = (np.repeat(v[None], count, axis=0) for v in self.limits)
         wide_low[:, self.constants.integer], wide_high[:, self.constants.integer] = lower, upper
-        for start in range(0, count, BATCHES[-1]):
-            low, high = wide_low[start : start + BATCHES[-1]], wide_high[start : start + BATCHES[-1]]
-            size = next(b for b in BATCHES if b >= len(low))
+        size = 1 if count < SINGLE else BATCH
+        qp = self.constants.lean if size == 1 else self.constants.qp
+        for start in range(0, count, size):
+            low, high = wide_low[start : start + size], wide_high[start : start + size]
             pad = np.minimum(np.arange(size), len(low) - 1)
-            qp = self.constants.lean if size <= LEAN else self.constants.qp
             out = _relax(qp, self.constants.rows, self.instance, low[pad], high[pad])
             parts.append([np.asarray(v)[: len(low)] for v in out])
         return Relaxations(*(np.concatenate(v) for v in zip(*parts, strict=True)))
@@ -320,7 +320,7 @@ def _enumerate(search: Search, model: LowerModel, lower, upper, most: int | None
         if search.out_of_time():
             search.discard(float(bounds[start]))
             return False
-        size = BATCHES[1] if start == 0 else BATCHES[2] if len(points) <= FEW else BATCHES[3]
+        size = 1 if start == 0 else BATCH
         search.evaluate(points[start : start + size], bounds[start : start + size])
         search.nodes += len(points[start : start + size])
         start += size
@@ -404,7 +404,7 @@ def _neighbours(search: Search, point: np.ndarray, lower, upper) -> np.ndarray:
     new = np.array([p.tobytes() not in search.seen for p in array])
     keep = good & new
     keep[0] = True
-    return array[keep][: BATCHES[2]]
+    return array[keep][: BATCH]
 
 
 def _branch_and_bound(search: Search, root: Relaxations, lower, upper, root_bound: float) -> float:
@@ -420,7 +420,7 @@ def _branch_and_bound(search: Search, root: Relaxations, lower, upper, root_boun
         if search.out_of_time():
             return heap[0][0]
         children = []
-        while heap and len(children) < BATCHES[2] - 1:
+        while heap and len(children) < BATCH - 1:
             bound, _, low, high, model, center = heapq.heappop(heap)
             if bound >= search.cutoff:
                 search.discard(bound)
@@ -448,7 +448,7 @@ def _branch_and_bound(search: Search, root: Relaxations, lower, upper, root_boun
                     search.discard(float(min(bounds[i], result.objective[i])))
             elif bounds[i] < search.cutoff:
                 candidates.append(search.rounded(result.x[i, c.integer], low[i], high[i]))
-        search.try_points(candidates[: BATCHES[2]])
+        search.try_points(candidates[: BATCH])
         for i in np.flatnonzero(~leaf):
             if bounds[i] >= search.cutoff:
                 search.discard(float(bounds[i]))

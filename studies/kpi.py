@@ -13,30 +13,33 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
+
+import jaxmpc  # noqa: F401  (switches JAX to float64)
 
 MOVE_THRESHOLD = 0.05  # % choke
 
 
-def moves_of(position: Float[Array, " sample"], start) -> Float[Array, " sample"]:
+def moves_of(position: Float[ArrayLike, " sample"], start) -> Float[Array, " sample"]:
     """m[0] = u[0] - start, m[k] = u[k] - u[k-1]; `start` is the position before the run, same unit."""
     return jnp.diff(jnp.asarray(position), prepend=jnp.asarray(start)[None])
 
 
-def travel(move: Float[Array, " sample"]) -> Float[Array, ""]:
+def travel(move: Float[ArrayLike, " sample"]) -> Float[Array, ""]:
     """Travel sum_k |m[k]|, in the unit of the move: the wear of a choke, in %."""
     return jnp.abs(jnp.asarray(move)).sum()
 
 
-def move_count(move: Float[Array, " sample"], threshold: float = MOVE_THRESHOLD) -> Int[Array, ""]:
+def move_count(move: Float[ArrayLike, " sample"], threshold: float = MOVE_THRESHOLD) -> Int[Array, ""]:
     """Number of samples with |m[k]| > threshold."""
     return (jnp.abs(jnp.asarray(move)) > threshold).sum()
 
 
 def reversal_events(
-    move: Float[Array, " sample"],
+    move: Float[ArrayLike, " sample"],
     threshold: float = MOVE_THRESHOLD,
-    segment: Int[Array, " sample"] | None = None,
+    segment: Int[ArrayLike, " sample"] | None = None,
 ) -> Bool[Array, " sample"]:
     """Samples at which the MV turns round.
 
@@ -62,7 +65,7 @@ def reversal_events(
 
 
 def count_by_segment(
-    event: Bool[Array, " sample"], segment: Int[Array, " sample"], segments: int
+    event: Bool[ArrayLike, " sample"], segment: Int[ArrayLike, " sample"], segments: int
 ) -> Int[Array, " segment"]:
     """Number of events with each label 0..segments-1; labels below 0 are left out."""
     label = jnp.arange(segments)[:, None]
@@ -83,7 +86,7 @@ def second_halves(window: Int[np.ndarray, " sample"]) -> Int[np.ndarray, " sampl
 
 
 def dwell(
-    move: Float[Array, " sample"], dt: float, threshold: float = MOVE_THRESHOLD
+    move: Float[ArrayLike, " sample"], dt: float, threshold: float = MOVE_THRESHOLD
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Mean and shortest time between successive moves [s].
 
@@ -102,23 +105,23 @@ def dwell(
 
 
 def mean_absolute_deviation(
-    cv: Float[Array, "sample cv"], setpoint: Float[Array, "sample cv"]
+    cv: Float[ArrayLike, "sample cv"], setpoint: Float[ArrayLike, "sample cv"]
 ) -> Float[Array, " cv"]:
     """mean_k |y[k] - r[k]| [CV unit]."""
     return jnp.abs(jnp.asarray(cv) - jnp.asarray(setpoint)).mean(axis=0)
 
 
 def integral_absolute_error(
-    cv: Float[Array, "sample cv"], setpoint: Float[Array, "sample cv"], dt: float
+    cv: Float[ArrayLike, "sample cv"], setpoint: Float[ArrayLike, "sample cv"], dt: float
 ) -> Float[Array, " cv"]:
     """IAE = dt sum_k |y[k] - r[k]| [CV unit s]."""
     return dt * jnp.abs(jnp.asarray(cv) - jnp.asarray(setpoint)).sum(axis=0)
 
 
 def time_outside_deadzone(
-    cv: Float[Array, "sample cv"],
-    setpoint: Float[Array, "sample cv"],
-    deadzone: Float[Array, " cv"],
+    cv: Float[ArrayLike, "sample cv"],
+    setpoint: Float[ArrayLike, "sample cv"],
+    deadzone: Float[ArrayLike, " cv"],
     dt: float,
 ) -> Float[Array, " cv"]:
     """Time with |y[k] - r[k]| > c [s], c the half width of the deadzone: dt times the number of samples."""
@@ -127,7 +130,9 @@ def time_outside_deadzone(
 
 
 def limit_excess(
-    value: Float[Array, "sample channel"], low: Float[Array, " channel"], high: Float[Array, " channel"]
+    value: Float[ArrayLike, "sample channel"],
+    low: Float[ArrayLike, " channel"],
+    high: Float[ArrayLike, " channel"],
 ) -> Float[Array, "sample channel"]:
     """How far a value is outside its limits, max(low - v, v - high, 0), same unit."""
     value = jnp.asarray(value)
@@ -135,16 +140,16 @@ def limit_excess(
 
 
 def limit_violations(
-    value: Float[Array, "sample channel"],
-    low: Float[Array, " channel"],
-    high: Float[Array, " channel"],
-    tolerance: Float[Array, " channel"] | float = 0.0,
+    value: Float[ArrayLike, "sample channel"],
+    low: Float[ArrayLike, " channel"],
+    high: Float[ArrayLike, " channel"],
+    tolerance: Float[ArrayLike, " channel"] | float = 0.0,
 ) -> Int[Array, " channel"]:
     """Number of samples that are outside their limits by more than `tolerance` (rounding), same unit."""
     return (limit_excess(value, low, high) > jnp.asarray(tolerance)).sum(axis=0)
 
 
-def windowed_mean(move: Float[Array, " sample"], samples: int) -> Float[Array, " sample"]:
+def windowed_mean(move: Float[ArrayLike, " sample"], samples: int) -> Float[Array, " sample"]:
     """Mean of the last n = `samples` moves up to and including k (6.6); moves before the run are zero."""
     total = jnp.cumsum(jnp.asarray(move))
     earlier = jnp.concatenate([jnp.zeros(samples, total.dtype), total])[: total.shape[0]]
@@ -152,7 +157,7 @@ def windowed_mean(move: Float[Array, " sample"], samples: int) -> Float[Array, "
 
 
 def mean_move_stops(
-    move: Float[Array, " sample"], samples: int, limit: float, threshold: float = MOVE_THRESHOLD
+    move: Float[ArrayLike, " sample"], samples: int, limit: float, threshold: float = MOVE_THRESHOLD
 ) -> Int[Array, ""]:
     """Steps of the staircase: how often opening pauses because the windowed mean is above its limit.
 
@@ -170,7 +175,7 @@ def mean_move_stops(
     return (follows & (mean[before] > limit)).sum()
 
 
-def opening_above_limit(move: Float[Array, " sample"], samples: int, limit: float) -> Int[Array, ""]:
+def opening_above_limit(move: Float[ArrayLike, " sample"], samples: int, limit: float) -> Int[Array, ""]:
     """Opening moves made although the mean of the `samples` moves before them was above `limit` (6.6).
 
     Both comparisons allow 1e-6 for rounding, in the unit of the move.
@@ -180,12 +185,12 @@ def opening_above_limit(move: Float[Array, " sample"], samples: int, limit: floa
     return ((before > limit + 1e-6) & (move > 1e-6)).sum()
 
 
-def solve_time_statistics(solve_time: Float[Array, " sample"]) -> Float[Array, " statistic"]:
+def solve_time_statistics(solve_time: Float[ArrayLike, " sample"]) -> Float[Array, " statistic"]:
     """Median, 99th percentile (linear interpolation) and largest solve time [s]."""
     return jnp.percentile(jnp.asarray(solve_time), jnp.array([50.0, 99.0, 100.0]))
 
 
-def largest_gap(gap: Float[Array, " sample"]) -> Float[Array, ""]:
+def largest_gap(gap: Float[ArrayLike, " sample"]) -> Float[Array, ""]:
     """Largest relative gap between objective and bound; infinite if a sample has none (NaN)."""
     gap = jnp.asarray(gap)
     return jnp.where(jnp.isnan(gap), jnp.inf, gap).max()

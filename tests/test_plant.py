@@ -56,9 +56,9 @@ def assert_physical(x, outputs):
     for pressure in (outputs.wellhead_pressure, outputs.bottom_hole_pressure, outputs.injection_pressure):
         assert (pressure > 5).all()
         assert (pressure < 105).all()
-    assert (outputs.annulus_pressure < 85.5).all()
-    # What it produces in a burst, it stored: no more than a blow-down from the trip pressure.
-    assert outputs.cv[..., 0].max() < 70000
+    assert (outputs.annulus_pressure < 80.5).all()
+    # The worst blow-down: a gas-filled, shut-in tubing, and the choke thrown wide open.
+    assert outputs.cv[..., 0].max() < 110000
 
 
 def test_default_start_is_the_shipped_steady_state():
@@ -111,6 +111,16 @@ def test_flow_stops_when_the_choke_shuts_and_returns_when_it_opens():
     _, outputs = batch_run(PLANT, demands)
     assert outputs.cv[0, 999].max() < 1e-3
     np.testing.assert_allclose(outputs.cv[0, -1], [11012.70003, 185.004338], rtol=1e-6)
+
+
+def test_restart_after_a_shut_in_with_lift_is_no_worse_than_a_blow_down_of_the_stored_gas():
+    demands = np.zeros((1, 2000, 2))
+    demands[0, :1000], demands[0, 1000:] = (0.0, 7500.0), (50.0, 7500.0)
+    x, outputs = batch_run(PLANT, demands)
+    gas = outputs.cv[0, 1000:, 0]
+    assert gas.max() < 40000
+    stored = x[0, 999, :3].sum() / (101325 * 0.02 / (8.314462618 * 288.15))
+    assert (gas[:60] * 10 / 3600).sum() < stored + 7500 * 600 / 3600 + 500
 
 
 def test_inputs_are_held_over_a_sample():

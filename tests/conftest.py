@@ -1,0 +1,66 @@
+"""Shared fixtures. Importing the package switches JAX to float64 and turns on the compilation cache."""
+
+import numpy as np
+import pytest
+
+import jaxmpc  # noqa: F401
+from jaxmpc.step_response import make_model
+from jaxmpc.structure import Structure
+from jaxmpc.tuning import make_tuning
+
+
+def second_order(gain, slow, fast, zero, samples, dt=10.0):
+    """Unit-step response of gain (zero s + 1) / ((slow s + 1)(fast s + 1)) at dt, 2 dt, ..."""
+    t = dt * np.arange(1, samples + 1)
+    a, b = (slow - zero) / (slow - fast), (fast - zero) / (fast - slow)
+    return gain * (1 - a * np.exp(-t / slow) - b * np.exp(-t / fast))
+
+
+@pytest.fixture(scope="session")
+def well_like_model():
+    """A synthetic 2 x 2 model that resembles the well, with 60 samples."""
+    responses = [
+        [(30.0, 120.0, 15.0, 400.0), (1.1, 90.0, 60.0, 0.0)],
+        [(0.7, 150.0, 12.0, 350.0), (0.006, 200.0, 60.0, 300.0)],
+    ]
+    coefficients = [[second_order(*entry, samples=60) for entry in row] for row in responses]
+    return make_model(coefficients, 10.0, ["gas", "oil"], ["choke", "lift"])
+
+
+@pytest.fixture(scope="session")
+def small_structure():
+    """Six blocks over 20 samples, whole choke moves of 2 %."""
+    return Structure(
+        cv_names=("gas", "oil"),
+        mv_names=("choke", "lift"),
+        prediction_horizon=40,
+        control_horizon=20,
+        blocks=(1, 1, 2, 4, 4, 8),
+        integer_step=(2.0, None),
+    )
+
+
+@pytest.fixture(scope="session")
+def thesis_fields():
+    """Fields of a tuning like Table 1 of the thesis."""
+    return dict(
+        cv_weight=[1e-4, 0.1],
+        move_weight=[250.0, 0.2],
+        soft_quadratic=[1e-4, 0.1],
+        soft_linear=[1e-4, 0.1],
+        deadzone=[1000.0, 5.0],
+        cv_low=[0.0, 0.0],
+        cv_high=[20000.0, 400.0],
+        slack_weight=1000.0,
+        mv_low=[0.0, 0.0],
+        mv_high=[100.0, 10000.0],
+        move_low=[-2.0, -200.0],
+        move_high=[2.0, 200.0],
+        bias_cutoff=1 / 20,
+    )
+
+
+@pytest.fixture(scope="session")
+def small_tuning(small_structure, thesis_fields):
+    """The thesis-like tuning for `small_structure`, with oscillation rows."""
+    return make_tuning(small_structure, **thesis_fields, oscillation_rows={"choke": True})
