@@ -72,6 +72,25 @@ def build_fmu(
     return cached if out is None else write_atomically(out, cached.read_bytes())
 
 
+def _compiler() -> str | None:
+    """Path of a C compiler, the one of ``$CC`` first."""
+    names = (os.environ.get("CC", ""), "cc", "gcc", "clang", "cl")
+    return next((found for name in names if name and (found := shutil.which(name.split()[0]))), None)
+
+
+def _cmake_options() -> dict[str, str]:
+    if os.name != "posix":
+        return {}
+    return {
+        "CMAKE_C_FLAGS:STRING": COMPILER_FLAGS,
+        "CMAKE_C_STANDARD_LIBRARIES:STRING": "-lm",
+        # FMPy's project asks for a C++ compiler too and never uses it: any path that needs no check will do.
+        "CMAKE_CXX_COMPILER:FILEPATH": _compiler() or "",
+        "CMAKE_CXX_COMPILER_WORKS:BOOL": "TRUE",
+        "CMAKE_CXX_COMPILER_FORCED:BOOL": "TRUE",
+    }
+
+
 def _tools() -> dict[str, str]:
     """Environment in which cmake and a C compiler are found; cmake's PyPI package serves if PATH has none."""
     environment = dict(os.environ)
@@ -83,8 +102,7 @@ def _tools() -> dict[str, str]:
             environment["PATH"] = folder + os.pathsep + environment.get("PATH", "")
         if not shutil.which("cmake", path=environment.get("PATH")):
             missing.append("cmake")
-    compilers = [os.environ.get("CC", ""), "cc", "gcc", "clang", "cl"]
-    if not any(name and shutil.which(name.split()[0]) for name in compilers):
+    if not _compiler():
         missing.append("a C compiler")
     if not missing and not shutil.which("make") and not shutil.which("ninja") and os.name == "posix":
         missing.append("make")
@@ -107,11 +125,10 @@ def _compiled(contents: dict[str, str]) -> bytes:
             path = tree / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(content)
-        options = {"CMAKE_C_FLAGS:STRING": COMPILER_FLAGS, "CMAKE_C_STANDARD_LIBRARIES:STRING": "-lm"}
         # A process of its own keeps cmake's output and the changed PATH out of this one.
         code = (
             "from fmpy.build import build_platform_binary as build; "
-            f"build({str(tree)!r}, {str(build)!r}, cmake_options={options if os.name == 'posix' else {}!r})"
+            f"build({str(tree)!r}, {str(build)!r}, cmake_options={_cmake_options()!r})"
         )
         done = subprocess.run(
             [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False

@@ -10,7 +10,7 @@ import dataclasses
 import datetime
 from typing import Any, NamedTuple
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -101,7 +101,7 @@ def apply_sequence(
     return np.array([o.cv for o in outputs]), np.array([o.mv for o in outputs])
 
 
-@eqx.filter_jit
+@jax.jit
 def _run(plant, state, demands):
     return plant.run(state, demands)
 

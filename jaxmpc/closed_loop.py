@@ -56,13 +56,17 @@ def simulate(
         raise InputError("plant.dt", plant.dt, f"the controller's sampling interval {structure.dt} s")
     if reference.cv_count != structure.cv_count:
         raise InputError(
-            "reference.setpoints", f"{reference.cv_count} columns", f"one per CV: {', '.join(structure.cv_names)}"
+            "reference.setpoints",
+            f"{reference.cv_count} columns",
+            f"one per CV: {', '.join(structure.cv_names)}",
         )
     setpoints = reference.sample(structure.dt, samples)
     offsets = np.zeros(len(setpoints)) if disturbance is None else np.asarray(disturbance, dtype=np.float64)
     if offsets.shape != (len(setpoints),) or not np.isfinite(offsets).all():
         raise InputError(
-            "disturbance", f"shape {list(offsets.shape)}", f"{len(setpoints)} finite offsets [bar], one per sample"
+            "disturbance",
+            f"shape {list(offsets.shape)}",
+            f"{len(setpoints)} finite offsets [bar], one per sample",
         )
     if isinstance(plant, WellPlant) and isinstance(controller, ContinuousController):
         record = _simulate_compiled(controller, plant, setpoints, offsets, progress)
@@ -98,7 +102,9 @@ def _simulate_compiled(controller, plant, setpoints, offsets, progress: Progress
     for begin in range(0, total, CHUNK):
         started = time.perf_counter()
         carry, record = jax.block_until_ready(
-            _run_chunk(controller, plant, carry, setpoints[begin : begin + CHUNK], offsets[begin : begin + CHUNK])
+            _run_chunk(
+                controller, plant, carry, setpoints[begin : begin + CHUNK], offsets[begin : begin + CHUNK]
+            )
         )
         parts.append(jax.tree.map(np.asarray, record))
         count = min(CHUNK, total - begin)

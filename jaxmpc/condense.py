@@ -82,7 +82,9 @@ class QpInstance(eqx.Module):
     row_high: Float[Array, " hard"]
 
 
-def dynamic_matrix(structure: Structure, coefficients: Float[Array, "cv mv n"]) -> Float[Array, "cv horizon mv block"]:
+def dynamic_matrix(
+    structure: Structure, coefficients: Float[Array, "cv mv n"]
+) -> Float[Array, "cv horizon mv block"]:
     """Theta of (5.4c) after blocking, for j = 1..Hp [CV unit per MV unit].
 
     Args:
@@ -92,7 +94,9 @@ def dynamic_matrix(structure: Structure, coefficients: Float[Array, "cv mv n"]) 
     horizon = structure.prediction_horizon
     samples = coefficients.shape[-1]
     index = np.minimum(np.arange(horizon), samples - 1)
-    step = jnp.concatenate([jnp.zeros((*coefficients.shape[:2], 1)), coefficients[..., index]], axis=-1)  # S(0) = 0
+    step = jnp.concatenate(
+        [jnp.zeros((*coefficients.shape[:2], 1)), coefficients[..., index]], axis=-1
+    )  # S(0) = 0
     starts, j = block_starts(structure), np.arange(1, horizon + 1)
     delay = np.maximum(j[:, None] - starts[None, :], 0)
     if structure.blocking == "inputs":
@@ -107,7 +111,9 @@ def dynamic_matrix(structure: Structure, coefficients: Float[Array, "cv mv n"]) 
 def integer_columns(structure: Structure) -> np.ndarray:
     """Positions of the integer moves in x."""
     blocks = structure.block_count
-    return np.concatenate([np.arange(mv * blocks, (mv + 1) * blocks) for mv in structure.integer_mvs] or [[]]).astype(int)
+    return np.concatenate(
+        [np.arange(mv * blocks, (mv + 1) * blocks) for mv in structure.integer_mvs] or [[]]
+    ).astype(int)
 
 
 def condense(
@@ -130,7 +136,11 @@ def condense(
         has_limits: whether any CV limit is finite (static; False drops their rows from the solver).
         packed: whether to keep the packed products of `theta` (up to 64 variables).
     """
-    blocks, mvs, rows = structure.block_count, structure.mv_count, structure.cv_count * structure.horizon_count
+    blocks, mvs, rows = (
+        structure.block_count,
+        structure.mv_count,
+        structure.cv_count * structure.horizon_count,
+    )
     full = dynamic_matrix(structure, coefficients)[:, structure.first_penalised - 1 :]
     counts = jnp.tile(jnp.asarray(moves_per_block(structure), dtype=float), mvs)
     raw = full.reshape(rows, mvs * blocks)
@@ -179,7 +189,9 @@ def _variable_scale(structure: Structure, tuning: Tuning, curvature) -> Float[Ar
     by_curvature = jnp.max(by_curvature.reshape(structure.mv_count, -1), axis=1)
     by_range = finite((tuning.mv_high - tuning.mv_low) / 8.0, by_curvature)
     by_move = finite(jnp.maximum(jnp.abs(tuning.move_low), jnp.abs(tuning.move_high)), by_range)
-    steps = [by_move[mv] if step is None else jnp.asarray(step) for mv, step in enumerate(structure.integer_step)]
+    steps = [
+        by_move[mv] if step is None else jnp.asarray(step) for mv, step in enumerate(structure.integer_step)
+    ]
     return jnp.repeat(jnp.stack(steps), structure.block_count)
 
 
@@ -226,6 +238,12 @@ def make_instance(
             down, up = whole_up(down), whole_down(up)
             room_down, room_up = whole_up(room_down), whole_down(room_up)
         own_low, own_high = jnp.full(blocks, down), jnp.full(blocks, up)
+        if structure.blocking == "inputs":  # the zero moves inside a block must be allowed, too
+            longer = np.asarray(structure.blocks) > 1
+            own_low = jnp.where(longer & (down > 0), jnp.maximum(own_low, 1.0), own_low)
+            own_high = jnp.where(longer & (down > 0), -1.0, own_high)
+            own_low = jnp.where(longer & (up < 0), 1.0, own_low)
+            own_high = jnp.where(longer & (up < 0), jnp.minimum(own_high, -1.0), own_high)
         held = jnp.round(last_move[mv] / unit)
         watch = tuning.oscillation_rows[mv] if integer else jnp.asarray(False)
         if integer:
@@ -237,8 +255,12 @@ def make_instance(
         if past_moves is not None and structure.mean_move_mode == "reactive":  # (6.6)
             mean = jnp.mean(past_moves[:, mv])
             limit = tuning.mean_move_limit[mv] * (1.0 + 1e-9)
-            own_high = own_high.at[0].set(jnp.where(mean > limit, jnp.minimum(own_high[0], jnp.maximum(own_low[0], 0.0)), own_high[0]))
-            own_low = own_low.at[0].set(jnp.where(mean < -limit, jnp.maximum(own_low[0], jnp.minimum(own_high[0], 0.0)), own_low[0]))
+            own_high = own_high.at[0].set(
+                jnp.where(mean > limit, jnp.minimum(own_high[0], jnp.maximum(own_low[0], 0.0)), own_high[0])
+            )
+            own_low = own_low.at[0].set(
+                jnp.where(mean < -limit, jnp.maximum(own_low[0], jnp.minimum(own_high[0], 0.0)), own_low[0])
+            )
         ends_low, ends_high = jnp.full(blocks, room_down), jnp.full(blocks, room_up)
         if recover:
             back_up = _fastest_return(own_high, watch, held, counts, sign=1.0)
@@ -319,6 +341,8 @@ def _window_budget(structure: Structure, tuning: Tuning, past_moves, mv: int):
     return jnp.maximum(total - kept, 0.0), jnp.maximum(total + kept, 0.0)
 
 
-def engineering_moves(structure: Structure, qp: CondensedQp, x: Float[Array, " n"]) -> Float[Array, "block mv"]:
+def engineering_moves(
+    structure: Structure, qp: CondensedQp, x: Float[Array, " n"]
+) -> Float[Array, "block mv"]:
     """Moves in MV units, block by MV, from the scaled vector."""
     return (x * qp.scale).reshape(structure.mv_count, structure.block_count).T

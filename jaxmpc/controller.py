@@ -164,7 +164,9 @@ class ContinuousController(eqx.Module):
     memory: _Memory
     qp: CondensedQp
 
-    def __init__(self, structure: Structure, tuning: Tuning, model: StepResponseModel, *, packed: bool = False):
+    def __init__(
+        self, structure: Structure, tuning: Tuning, model: StepResponseModel, *, packed: bool = False
+    ):
         if structure.integer_mvs:
             raise InputError(
                 "structure.integer_step",
@@ -173,7 +175,9 @@ class ContinuousController(eqx.Module):
                 "Use MixedIntegerController, or structure.relaxed()",
             )
         check_match(structure, model)
-        self.memory = _Memory(structure, tuning, model.extended(max(structure.prediction_horizon, model.samples)))
+        self.memory = _Memory(
+            structure, tuning, model.extended(max(structure.prediction_horizon, model.samples))
+        )
         self.qp = condense(structure, tuning, model.coefficients, envelope=0, packed=packed)
 
     @property
@@ -224,10 +228,15 @@ class ContinuousController(eqx.Module):
         blocks = structure.block_count
         unit = self.qp.scale[::blocks]
         low, high = instance.lower[::blocks], instance.upper[::blocks]
-        first = np.array([np.flatnonzero(hard_rows(structure)[:, mv * blocks])[0] for mv in range(structure.mv_count)])
+        first = np.array(
+            [np.flatnonzero(hard_rows(structure)[:, mv * blocks])[0] for mv in range(structure.mv_count)]
+        )
         end_low, end_high = instance.row_low[first], instance.row_high[first]
         held = moves_per_block(structure)[0]
-        move = jnp.clip(moves[0] / unit, jnp.maximum(low, end_low / held), jnp.minimum(high, end_high / held)) * unit
+        move = (
+            jnp.clip(moves[0] / unit, jnp.maximum(low, end_low / held), jnp.minimum(high, end_high / held))
+            * unit
+        )
         move = jnp.where(good, move, 0.0)
         moves = jnp.where(good, moves, 0.0)
         recovering = outside_limits(tuning, state.mv)
@@ -282,7 +291,9 @@ class MixedIntegerController:
         if finish not in FINISHES:
             raise InputError("finish", finish, f"one of {', '.join(FINISHES)}")
         self.planner = Planner(structure, tuning, model)
-        self.memory = _Memory(structure, tuning, model.extended(max(structure.prediction_horizon, model.samples)))
+        self.memory = _Memory(
+            structure, tuning, model.extended(max(structure.prediction_horizon, model.samples))
+        )
         self.gap, self.time_limit, self.finish = gap, time_limit, finish
 
     @property
@@ -322,7 +333,11 @@ class MixedIntegerController:
 
     def _after(self, state: ControllerState, plan: Plan | None) -> tuple[ControllerState, StepInfo]:
         good = plan is not None and plan.moves is not None
-        moves = plan.moves if plan is not None and plan.moves is not None else np.zeros_like(np.asarray(state.plan))
+        moves = (
+            plan.moves
+            if plan is not None and plan.moves is not None
+            else np.zeros_like(np.asarray(state.plan))
+        )
         recovering = bool(outside_limits(self.tuning, state.mv))
         state = _remember(self.memory, state, jnp.asarray(moves[0]), jnp.asarray(moves))
         number = lambda value: np.float64(np.nan if value is None else value)  # noqa: E731

@@ -23,7 +23,9 @@ class ReducedMilp:
         unit: objective values are divided by this before HiGHS sees them.
     """
 
-    def __init__(self, chains: list[Chain], lower: np.ndarray, upper: np.ndarray, own: np.ndarray, unit: float):
+    def __init__(
+        self, chains: list[Chain], lower: np.ndarray, upper: np.ndarray, own: np.ndarray, unit: float
+    ):
         self.lower, self.upper, self.unit = lower, upper, unit
         self.free = np.flatnonzero(upper > lower)
         self.base = float(sum(own[i, 0] for i in range(len(lower)))) / unit
@@ -55,7 +57,9 @@ class ReducedMilp:
         self._hard_rows(chains)
 
     def _row(self, low: float, high: float, index: np.ndarray, value: np.ndarray) -> None:
-        self.highs.addRow(low, high, len(index), np.asarray(index, dtype=np.int32), np.asarray(value, dtype=float))
+        self.highs.addRow(
+            low, high, len(index), np.asarray(index, dtype=np.int32), np.asarray(value, dtype=float)
+        )
 
     def _in_binaries(self, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """Columns, values and constant of a linear form in the moves."""
@@ -128,7 +132,9 @@ class ReducedMilp:
             ``(bound, point, finished)``: a lower bound of everything not forbidden, the best whole moves (None
             if there are none below the cutoff), and whether HiGHS finished.
         """
-        self.highs.setOptionValue("time_limit", 1e30 if seconds is None else float(self.highs.getRunTime() + max(seconds, 1e-3)))
+        self.highs.setOptionValue(
+            "time_limit", 1e30 if seconds is None else float(self.highs.getRunTime() + max(seconds, 1e-3))
+        )
         self.highs.run()
         status = self.highs.getModelStatus()
         info = self.highs.getInfo()

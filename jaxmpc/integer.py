@@ -75,7 +75,9 @@ class Constants:
         self.levels = len(self.slope) // max(len(self.integer), 1)
         self.scale = max(float(np.diag(np.asarray(qp.curvature)).max()), 1e-12)
         full = np.diag(np.asarray(qp.curvature))[self.integer]
-        self.own_weight = 0.5 * (full - np.diag(hessian)[self.integer]) if self.levels else np.zeros(len(self.integer))
+        self.own_weight = (
+            0.5 * (full - np.diag(hessian)[self.integer]) if self.levels else np.zeros(len(self.integer))
+        )
 
 
 @dataclasses.dataclass
@@ -233,20 +235,25 @@ def solve_integer(
     deadline = None if time_limit is None else time.perf_counter() + time_limit
     search = Search(constants, instance, gap, deadline)
     integer = constants.integer
-    low, high = np.round(search.limits[0][integer]).astype(int), np.round(search.limits[1][integer]).astype(int)
+    low, high = (
+        np.round(search.limits[0][integer]).astype(int),
+        np.round(search.limits[1][integer]).astype(int),
+    )
     lower, upper, possible = propagate(search.chains, low[None], high[None])
     if not possible[0] or not continuous_feasible(constants.structure, instance):
         return SearchResult(None, np.inf, np.inf, INFEASIBLE, None, 0)
     lower, upper = lower[0], upper[0]
-    zero = search.rounded(np.zeros(len(integer)), lower, upper)
-    if zero is None and nearest(search.chains, np.zeros(len(integer)), lower, upper) is None:
+    zero = np.zeros(len(integer))
+    if search.rounded(zero, lower, upper) is None and nearest(search.chains, zero, lower, upper) is None:
         return SearchResult(None, np.inf, np.inf, INFEASIBLE, None, 0)
     root = search.relax(lower[None], upper[None])
     search.nodes = 1
-    points = [zero, search.rounded(root.x[0, integer], lower, upper)]
-    points += [search.rounded(start, lower, upper) for start in (starts or [])]
-    search.try_points(points)
     root_bound = search.root_bound = max(float(root.bound[0]), 0.0)
+    # the rounded relaxation is optimal nearly always; the others are tried only if it does not close the problem
+    for wanted in (root.x[0, integer], *(starts or []), zero):
+        search.try_points([search.rounded(wanted, lower, upper)])
+        if root_bound >= search.cutoff:
+            break
     if finish == "auto" and root_bound >= search.cutoff:
         return search.finish("relaxation", root_bound)
     if search.out_of_time():
@@ -342,7 +349,9 @@ def _cut_of(search: Search, result: Relaxations, lane: int, lower, upper):
     return float(value), at, gradient
 
 
-def _outer_approximation(search: Search, root: Relaxations, lower, upper, seconds: float | None) -> tuple[bool, float]:
+def _outer_approximation(
+    search: Search, root: Relaxations, lower, upper, seconds: float | None
+) -> tuple[bool, float]:
     """Close the reduced problem with MILPs over cuts; returns whether it is closed, and the bound reached."""
     from jaxmpc.highs import ReducedMilp  # HiGHS is loaded when it is first needed
 
@@ -351,7 +360,9 @@ def _outer_approximation(search: Search, root: Relaxations, lower, upper, second
     width = int((upper - lower).max(initial=0)) + 1
     values = lower[:, None] + np.arange(width)[None, :]
     own = c.own_weight[:, None] * values.astype(float) ** 2
-    master = ReducedMilp(search.chains, lower, upper, own, unit=search.reference if np.isfinite(search.value) else c.scale)
+    master = ReducedMilp(
+        search.chains, lower, upper, own, unit=search.reference if np.isfinite(search.value) else c.scale
+    )
     wide = search.relax(lower[None], upper[None])
     search.nodes += 1
     master.add_cut(*_cut_of(search, wide, 0, lower, upper))
@@ -404,14 +415,19 @@ def _neighbours(search: Search, point: np.ndarray, lower, upper) -> np.ndarray:
     new = np.array([p.tobytes() not in search.seen for p in array])
     keep = good & new
     keep[0] = True
-    return array[keep][: BATCH]
+    return array[keep][:BATCH]
 
 
 def _branch_and_bound(search: Search, root: Relaxations, lower, upper, root_bound: float) -> float:
     """Best-first branch and bound, a batch of nodes at a time; returns the least bound still open."""
     c = search.constants
     counter = itertools.count()
-    model = search.lower_model(root, 0, np.round(search.limits[0][c.integer]).astype(int), np.round(search.limits[1][c.integer]).astype(int))
+    model = search.lower_model(
+        root,
+        0,
+        np.round(search.limits[0][c.integer]).astype(int),
+        np.round(search.limits[1][c.integer]).astype(int),
+    )
     heap = [(root_bound, next(counter), lower, upper, model, root.x[0, c.integer])]
     while heap:
         if heap[0][0] >= search.cutoff:
@@ -448,7 +464,7 @@ def _branch_and_bound(search: Search, root: Relaxations, lower, upper, root_boun
                     search.discard(float(min(bounds[i], result.objective[i])))
             elif bounds[i] < search.cutoff:
                 candidates.append(search.rounded(result.x[i, c.integer], low[i], high[i]))
-        search.try_points(candidates[: BATCH])
+        search.try_points(candidates[:BATCH])
         for i in np.flatnonzero(~leaf):
             if bounds[i] >= search.cutoff:
                 search.discard(float(bounds[i]))
@@ -458,7 +474,14 @@ def _branch_and_bound(search: Search, root: Relaxations, lower, upper, root_boun
             search.discard(max(float(bounds[i]), search.cutoff))
             tight_low, tight_high, good = propagate(search.chains, tight_low[None], tight_high[None])
             if good[0]:
-                entry = (float(bounds[i]), next(counter), tight_low[0], tight_high[0], model, result.x[i, c.integer])
+                entry = (
+                    float(bounds[i]),
+                    next(counter),
+                    tight_low[0],
+                    tight_high[0],
+                    model,
+                    result.x[i, c.integer],
+                )
                 heapq.heappush(heap, entry)
     return np.inf
 
@@ -475,7 +498,9 @@ def _split(search: Search, bound: float, low, high, model: LowerModel, center) -
         curve = 0.5 * away**2 / model.radius[i] if np.isfinite(model.radius[i]) else np.zeros(len(values))
         cost = model.excess[i, values - model.lower[i]] + curve
         cut = int(np.clip(np.floor(center[i] + 1e-9), low[i], high[i] - 1))
-        if abs(center[i] - np.round(center[i])) < 1e-6:  # whole already: separate the cheapest value from the rest
+        if (
+            abs(center[i] - np.round(center[i])) < 1e-6
+        ):  # whole already: separate the cheapest value from the rest
             cut = int(np.clip(np.round(center[i]), low[i], high[i] - 1))
         down, up = cost[values <= cut].min(), cost[values > cut].min()
         score = min(down, up) * (1.0 + 1e-3) + 1e-3 * max(down, up)

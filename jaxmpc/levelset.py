@@ -65,9 +65,10 @@ def schur_complement(hessian: np.ndarray, integer: np.ndarray) -> tuple[np.ndarr
     # round-off must not add curvature: shave it off, then drop what is negative
     values = np.maximum(values - 1e-11 * top - 1e-13 * np.abs(hessian).max(initial=0.0), 0.0)
     block = (vectors * values) @ vectors.T
-    floor = 1e-12 * max(top, 1e-300)
-    radius = ((vectors**2) / np.maximum(values, floor)).sum(axis=1)
-    radius = np.where(((vectors**2) * (values <= floor)).sum(axis=1) > 1e-12, np.inf, radius)
+    flat = values <= 1e-12 * top
+    with np.errstate(divide="ignore"):
+        radius = ((vectors**2) * np.where(flat, 0.0, 1.0 / np.where(flat, 1.0, values))).sum(axis=1)
+    radius = np.where(((vectors**2) * flat).sum(axis=1) > 1e-12, np.inf, radius)
     return block, radius
 
 
@@ -76,8 +77,10 @@ def exclude(model: LowerModel, cutoff: float) -> tuple[np.ndarray, np.ndarray]:
     values = model.lower[:, None] + np.arange(model.excess.shape[1])[None, :]
     away = values - model.center[:, None]
     with np.errstate(invalid="ignore"):
-        single = model.value + model.excess + np.where(
-            np.isfinite(model.radius)[:, None], 0.5 * away**2 / model.radius[:, None], 0.0
+        single = (
+            model.value
+            + model.excess
+            + np.where(np.isfinite(model.radius)[:, None], 0.5 * away**2 / model.radius[:, None], 0.0)
         )
     alive = single < cutoff
     none = ~alive.any(axis=1)

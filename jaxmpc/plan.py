@@ -97,7 +97,11 @@ class Planner:
         """Constants for integer ranges of so many steps, made when first needed."""
         if envelope not in self._constants:
             qp = _condense(
-                self.structure, self.tuning, self.model.coefficients, envelope=envelope, has_limits=self.has_limits
+                self.structure,
+                self.tuning,
+                self.model.coefficients,
+                envelope=envelope,
+                has_limits=self.has_limits,
             )
             self._constants[envelope] = Constants(self.structure, qp)
         return self._constants[envelope]
@@ -139,7 +143,15 @@ class Planner:
 
         def instance_of(constants: Constants) -> QpInstance:
             return _make_instance(
-                self.structure, self.tuning, constants.qp, free_response, setpoint, mv_now, as_array(last_move), past, recover
+                self.structure,
+                self.tuning,
+                constants.qp,
+                free_response,
+                setpoint,
+                mv_now,
+                as_array(last_move),
+                past,
+                recover,
             )
 
         constants = self.constants(1)
@@ -147,7 +159,9 @@ class Planner:
         integer = constants.integer
         if len(integer):
             instance = self._bounded(instance)
-            widest = np.abs(np.concatenate([np.asarray(instance.lower)[integer], np.asarray(instance.upper)[integer]]))
+            widest = np.abs(
+                np.concatenate([np.asarray(instance.lower)[integer], np.asarray(instance.upper)[integer]])
+            )
             envelope = int(widest.max())
             if envelope > 1:
                 constants = self.constants(envelope if envelope <= WIDEST_ENVELOPE else 0)
@@ -204,7 +218,9 @@ class Planner:
         upper[integer] = np.minimum(upper[integer], np.floor(center + reach))
         return eqx.tree_at(lambda i: (i.lower, i.upper), instance, (jnp.asarray(lower), jnp.asarray(upper)))
 
-    def _plan(self, constants, instance, result: SearchResult, mv_now, free_response, setpoint, gap, begin) -> Plan:
+    def _plan(
+        self, constants, instance, result: SearchResult, mv_now, free_response, setpoint, gap, begin
+    ) -> Plan:
         elapsed = lambda: time.perf_counter() - begin  # noqa: E731
         if result.x is None:
             name = codes.STATUS[result.status]
@@ -236,7 +252,9 @@ class Planner:
             finished_by=result.finished_by if state == codes.OPTIMAL else None,
         )
 
-    def objective(self, moves, free_response, setpoint) -> tuple[float, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    def objective(
+        self, moves, free_response, setpoint
+    ) -> tuple[float, np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """(6.6) of a plan in engineering units, with its predictions and limit violations.
 
         Args:
@@ -302,7 +320,9 @@ def check_match(structure: Structure, model: StepResponseModel) -> None:
         ("mv", structure.mv_names, model.mv_names),
     ):
         if ours != theirs:
-            raise InputError(f"model.{key}", list(theirs), f"the structure's names in its order, {list(ours)}")
+            raise InputError(
+                f"model.{key}", list(theirs), f"the structure's names in its order, {list(ours)}"
+            )
     if abs(structure.dt - model.dt) > 1e-9 * structure.dt:
         raise InputError("model.dt", model.dt, f"the structure's sampling interval {structure.dt} s")
 
@@ -311,7 +331,9 @@ def check_vector(path: str, value, names: tuple[str, ...], unit: str) -> np.ndar
     """A finite vector with one entry per name, or an `InputError`."""
     array = np.asarray(value, dtype=np.float64)
     if array.shape != (len(names),) or not np.isfinite(array).all():
-        raise InputError(path, np.asarray(value).tolist(), f"{len(names)} finite numbers [{unit}] for {', '.join(names)}")
+        raise InputError(
+            path, np.asarray(value).tolist(), f"{len(names)} finite numbers [{unit}] for {', '.join(names)}"
+        )
     return array
 
 
@@ -356,7 +378,9 @@ def solve_plan(
         array = np.asarray(value, dtype=np.float64)
         expected = (structure.prediction_horizon, structure.cv_count)
         if array.shape != expected or not np.isfinite(array).all():
-            raise InputError(path, f"shape {list(array.shape)}", f"finite numbers of shape {list(expected)} [CV unit]")
+            raise InputError(
+                path, f"shape {list(array.shape)}", f"finite numbers of shape {list(expected)} [CV unit]"
+            )
     low, high = np.asarray(tuning.mv_low), np.asarray(tuning.mv_high)
     for i, name in enumerate(structure.mv_names):
         drift = DRIFT * (structure.integer_step[i] or max(1.0, abs(now[i])))

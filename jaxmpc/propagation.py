@@ -59,14 +59,23 @@ def chains_of(structure: Structure, row_low: np.ndarray, row_high: np.ndarray) -
             whole = lambda v: np.clip(np.round(v), -UNBOUNDED, UNBOUNDED).astype(int)  # noqa: E731
             chains.append(
                 Chain(
-                    columns, counts, whole(low), whole(high), coupled, windows, row_low[ahead], row_high[ahead]
+                    columns,
+                    counts,
+                    whole(low),
+                    whole(high),
+                    coupled,
+                    windows,
+                    row_low[ahead],
+                    row_high[ahead],
                 )
             )
         row += len(windows)
     return chains
 
 
-def propagate(chains: list[Chain], lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def propagate(
+    chains: list[Chain], lower: np.ndarray, upper: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Tighten integer limits along every chain until nothing changes.
 
     Args:
@@ -133,7 +142,9 @@ def satisfied(chains: list[Chain], moves: np.ndarray, lower: np.ndarray, upper: 
     return good
 
 
-def nearest(chains: list[Chain], wanted: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray | None:
+def nearest(
+    chains: list[Chain], wanted: np.ndarray, lower: np.ndarray, upper: np.ndarray
+) -> np.ndarray | None:
     """Feasible whole moves closest to `wanted` in the sum of absolute differences, or None where there are none.
 
     Window rows are not looked at. Dynamic programming over (position, last move), exact; costs milliseconds and is called only when rounding

@@ -128,7 +128,9 @@ def make_tuning(structure: Structure, *, path: str = "tuning", **fields) -> Tuni
                 )
             if np.isposinf(values[low][i]) or np.isneginf(values[high][i]):
                 raise InputError(
-                    f"{path}.{low}[{i}]", values[low][i], f"a limit below +inf (and {high}[{i}] above -inf) for {name}"
+                    f"{path}.{low}[{i}]",
+                    values[low][i],
+                    f"a limit below +inf (and {high}[{i}] above -inf) for {name}",
                 )
     values["oscillation_rows"] = _flags(f"{path}.oscillation_rows", fields.get("oscillation_rows"), structure)
     cutoff = fields.get("bias_cutoff", np.inf)
@@ -162,7 +164,9 @@ def _vector(path: str, given, names: tuple[str, ...], key: str) -> np.ndarray:
         if isinstance(value, bool) or not isinstance(value, (int, float)) or np.isnan(value):
             raise InputError(f"{path}[{i}]", value, f"a number [{UNITS[key]}] for {names[i]}")
         if key not in LIMITS and (value < 0 or np.isinf(value)):
-            raise InputError(f"{path}[{i}]", value, f"a finite number, 0 or more [{UNITS[key]}] for {names[i]}")
+            raise InputError(
+                f"{path}[{i}]", value, f"a finite number, 0 or more [{UNITS[key]}] for {names[i]}"
+            )
         if key == "mean_move_limit" and value < 0:
             raise InputError(f"{path}[{i}]", value, f"0 or more [{UNITS[key]}] for {names[i]}")
         out[i] = value
@@ -188,7 +192,9 @@ def _flags(path: str, given, structure: Structure) -> np.ndarray:
         i = names.index(name)
         if flag and structure.integer_step[i] is None:
             raise InputError(
-                f"{path}.{name}", flag, "false for a continuous MV (the width of the rows is the integer step)"
+                f"{path}.{name}",
+                flag,
+                "false for a continuous MV (the width of the rows is the integer step)",
             )
         out[i] = flag
     return out

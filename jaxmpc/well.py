@@ -154,11 +154,11 @@ class WellParameters(eqx.Module):
 def model(ops, x: Sequence, u: Sequence, p) -> tuple[list, list]:
     """Time derivatives and measurements of the well.
 
-    Three terms keep it stable with steps of 1 s and physical from shut-in to full opening: dissolved gas softens
-    nearly full sections (`live_oil_share`), two such sections equalise at a bounded rate (`equalising_rate`),
-    and the supply throttles back as the annulus fills (`trip_start`, `trip_end`). Each is C1, and exactly
-    inactive in every steady state with 2000 m3/h of lift and 2 % choke or more, and on the way there from the
-    working point.
+    Three terms keep it stable with steps of 1 s and physical from shut-in to full opening: dissolved gas
+    softens nearly full sections (`live_oil_share`), two such sections equalise at a bounded rate
+    (`equalising_rate`), and the supply throttles back as the annulus fills (`trip_start`, `trip_end`). Each
+    is C1, and exactly inactive in every steady state with 2000 m3/h of lift and 2 % choke or more, and on the
+    way there from the working point.
 
     Args:
         ops: functions beyond arithmetic: ``sqrt(x)`` and ``positive(x)`` = max(x, 0).

@@ -161,6 +161,19 @@ def sampling_interval(data: xr.Dataset) -> float:
     return float(data.attrs["dt"])
 
 
+def window_deviation(data: xr.Dataset, controller: str) -> np.ndarray:
+    """Mean absolute deviation from the setpoint in every window, ``"window cv"`` [CV unit].
+
+    Args:
+        data: results.
+        controller: name of a finished run.
+    """
+    run = data.sel(controller=controller)
+    away = np.abs(run.measurement.values - run.setpoint.values)
+    window = data.window.values
+    return np.array([away[window == w].mean(axis=0) for w in range(int(window.max()) + 1)])
+
+
 def final_deviation(data: xr.Dataset, controller: str) -> np.ndarray:
     """Mean deviation over the last quarter of every window, in deadzone half widths.
 

@@ -49,7 +49,7 @@ def run(controller, plant, setpoint, samples):
 def test_without_model_error_the_bias_stays_zero(well_like_model, small_structure, small_tuning):
     controller = MixedIntegerController(small_structure, small_tuning, well_like_model)
     infos, _, states = run(
-        controller, LinearPlant(well_like_model), [11500.0, 195.0], 70
+        controller, LinearPlant(well_like_model), [13500.0, 215.0], 70
     )  # longer than N = 60
     assert max(np.abs(np.asarray(s.bias_raw)).max() for s in states) < 1e-8  # rounding of 1e4 over 70 samples
     assert any(info.move[0] != 0 for info in infos)

@@ -150,7 +150,7 @@ def assert_optimal(shape: dict, seed: int, twists: tuple[str, ...]) -> None:
 
 @pytest.mark.parametrize("twists", TWISTS_PER_SHAPE)
 def test_steps_of_an_unusual_shape_are_optimal(twists):
-    """A short model, a late first penalty, moves beyond the prediction, more CVs than MVs, all MVs integer."""
+    """A short model, a late first penalty, moves beyond the prediction, three CVs, all MVs integer."""
     for seed in range(3):
         assert_optimal(UNUSUAL, 60 + seed, twists)
 
@@ -193,14 +193,14 @@ def test_random_shapes_and_situations_are_solved_exactly(seed):
         assert flaws == [], (what, finish, json.dumps(body))
 
 
-# ---------------------------------------------------------------------------------------------- metamorphic
+# ------------------------------------------------------------------------------------------- metamorphic
 
 
 def same_plan(one, other, body: dict) -> None:
-    """Two plans of one problem: equal costs, equal integer moves, continuous moves as close as the gap allows.
+    """Two plans of one problem: equal costs and integer moves, continuous moves as close as the gap allows.
 
-    The cost grows by at least P dx^2 away from the optimum, so two plans within a relative gap of 1e-6 lie within
-    2 sqrt(1e-6 J / P) of each other.
+    The cost grows by at least P dx^2 away from the optimum, so two plans within a relative gap of 1e-6 lie
+    within 2 sqrt(1e-6 J / P) of each other.
     """
     n = oracles.read(body)
     assert other.objective == pytest.approx(one.objective, rel=oracles.EXACT)
@@ -275,7 +275,7 @@ def test_where_the_search_starts_does_not_change_the_answer(name):
         assert solve(started).objective == pytest.approx(solve(body).objective, rel=oracles.EXACT)
 
 
-# --------------------------------------------------------------------------------------- limits of the solve
+# ----------------------------------------------------------------------------------- limits of the solve
 
 
 def test_a_time_limit_returns_a_feasible_plan_with_its_true_gap():

@@ -1,8 +1,8 @@
 """Steps of the thesis's size against SCIP on the full form, and the relaxed ones against two QP solvers.
 
-SCIP may stop at its time limit: then its plan must not beat ours, and its bound must not exceed our cost, both
-by more than 1e-6 relative (`oracles.complaints`). SCIP holds rows to 1e-8 in scaled units, which costs its bound
-some 1e-6 relative on the safe side.
+SCIP may stop at its time limit: then its plan must not beat ours, and its bound must not exceed our cost,
+both by more than 1e-6 relative (`oracles.complaints`). SCIP holds rows to 1e-8 in scaled units, which costs
+its bound some 1e-6 relative, on the safe side.
 """
 
 import numpy as np
