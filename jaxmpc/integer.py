@@ -28,6 +28,7 @@ from jaxmpc.structure import Structure
 
 BATCH = 16  # lanes of a batched relaxation call; fewer than `SINGLE` problems are solved one by one
 SINGLE = 4
+WIDE = 128  # variables from which problems are solved one by one
 FEW = 128  # combinations that are enumerated rather than searched
 HIGHS_SECONDS = 0.1  # what the reduced MILP may take before branch and bound closes the rest
 FINISHES = ("auto", "enumeration", "highs", "branch-and-bound")
@@ -113,6 +114,7 @@ class Search:
         self.root_bound = 0.0  # every term of (6.6) is non-negative
         self.nodes = 0
         self.seen: set[bytes] = set()
+        self.lanes = BATCH if len(self.limits[0]) <= WIDE else 1
 
     # ---- bookkeeping
     @property
@@ -143,7 +145,7 @@ class Search:
         count, parts = len(lower), []
         wide_low, wide_high = (np.repeat(v[None], count, axis=0) for v in self.limits)
         wide_low[:, self.constants.integer], wide_high[:, self.constants.integer] = lower, upper
-        size = 1 if count < SINGLE else BATCH
+        size = 1 if count < SINGLE else self.lanes
         qp = self.constants.lean if size == 1 else self.constants.qp
         for start in range(0, count, size):
             low, high = wide_low[start : start + size], wide_high[start : start + size]
@@ -327,7 +329,7 @@ def _enumerate(search: Search, model: LowerModel, lower, upper, most: int | None
         if search.out_of_time():
             search.discard(float(bounds[start]))
             return False
-        size = 1 if start == 0 else BATCH
+        size = 1 if start == 0 else search.lanes
         search.evaluate(points[start : start + size], bounds[start : start + size])
         search.nodes += len(points[start : start + size])
         start += size
@@ -436,7 +438,7 @@ def _branch_and_bound(search: Search, root: Relaxations, lower, upper, root_boun
         if search.out_of_time():
             return heap[0][0]
         children = []
-        while heap and len(children) < BATCH - 1:
+        while heap and len(children) < max(search.lanes - 1, 1):
             bound, _, low, high, model, center = heapq.heappop(heap)
             if bound >= search.cutoff:
                 search.discard(bound)

@@ -7,7 +7,7 @@ of all Newton matrices is a single matrix product.
 Method: Mehrotra's predictor-corrector (Nocedal and Wright 2006, algorithm 16.4) on the problem with its slacks eta and
 eps, whose Newton system is reduced by hand to the moves and the eps. Slack rows start feasible and stay so; limits
 of moves and positions may start infeasible. Every solve returns a lower bound from its multipliers that is
-valid whether it converged or not, see `_dual_bound`.
+valid whether it converged or not, see `dual_bound`.
 """
 
 from __future__ import annotations
@@ -75,6 +75,12 @@ def evaluate(qp: CondensedQp, instance: QpInstance, x: Float[Array, " n"]) -> Fl
     rows = jnp.sum(qp.quadratic * t**2 + (qp.soft_quadratic * beyond + qp.soft_linear) * beyond)
     own = jnp.sum(qp.move_weight * x**2)
     return rows + own + jnp.sum(_limit_cost(qp, instance, t))
+
+
+def solver_unit(qp: CondensedQp, instance: QpInstance) -> Float[Array, ""]:
+    """What the solvers divide the objective by, so that curvatures and prices are of the order of one."""
+    unit = jnp.maximum(jnp.max(jnp.diagonal(qp.curvature)), 1e-12)
+    return jnp.maximum(unit, 1e-2 * jnp.max(jnp.abs(2.0 * (qp.quadratic * instance.offset) @ qp.theta)))
 
 
 def _limit_cost(qp: CondensedQp, instance: QpInstance, t):
@@ -172,8 +178,7 @@ def solve(
     takes_part = (jnp.abs(w_matrix) @ keep) > 0.0
     offset = instance.offset
     gradient0 = 2.0 * (qp.quadratic * offset) @ qp.theta
-    unit = jnp.maximum(jnp.max(jnp.diagonal(qp.curvature)), 1e-12)
-    unit = jnp.maximum(unit, 1e-2 * jnp.max(jnp.abs(gradient0)))
+    unit = solver_unit(qp, instance)
     hessian, linear = qp.hessian / unit, gradient0 / unit
     s2, s1, c = 2.0 * qp.soft_quadratic / unit, qp.soft_linear / unit, qp.deadzone
     soft = (s2 + s1) > 0.0
@@ -416,10 +421,10 @@ def solve(
         row_high_price=price["row_high"],
         residual=state.residual,
     )
-    return _dual_bound(qp, w_matrix, instance, solution, lower, upper, price["high"], price["low"])
+    return dual_bound(qp, w_matrix, instance, solution, lower, upper, price["high"], price["low"])
 
 
-def _dual_bound(qp, w_matrix, instance, solution, lower, upper, high, low):
+def dual_bound(qp, w_matrix, instance, solution, lower, upper, high, low):
     """Lagrangian lower bound with prices made dual feasible, and the prices that were used.
 
     soft(t) >= v t - soft*(v) with soft*(v) = c|v| + max(|v| - s, 0)^2 / (4 S); rho max(0, w) >= sum of p w for
