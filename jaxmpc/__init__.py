@@ -3,10 +3,11 @@
 Importing the package switches JAX to float64: pruning integer decisions needs bounds that are right to
 1e-6, and float32 bounds are not. It also turns on JAX's persistent compilation cache, so that a second
 process starts without compiling; set ``JAX_COMPILATION_CACHE_DIR`` to move it or ``JAXMPC_NO_JIT_CACHE=1``
-to leave it off.
+to leave it off. The public names of its modules can be taken from the package itself.
 """
 
 import os as _os
+from importlib import import_module as _import_module
 from pathlib import Path as _Path
 
 import jax as _jax
@@ -16,3 +17,31 @@ if not _os.environ.get("JAX_COMPILATION_CACHE_DIR") and not _os.environ.get("JAX
     _cache = _Path(_os.environ.get("JAXMPC_CACHE") or _Path.home() / ".cache" / "jaxmpc") / "jit"
     _jax.config.update("jax_compilation_cache_dir", str(_cache))
     _jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+_HOME_OF = {
+    "ContinuousController": "controller",
+    "InputError": "errors",
+    "MixedIntegerController": "controller",
+    "Reference": "reference",
+    "StepResponseModel": "step_response",
+    "Structure": "structure",
+    "Trajectory": "trajectory",
+    "WellPlant": "plant",
+    "make_model": "step_response",
+    "make_tuning": "tuning",
+    "simulate": "closed_loop",
+    "simulate_batch": "closed_loop",
+    "solve_plan": "plan",
+    "stack_tunings": "tuning",
+}
+
+
+def __getattr__(name: str):
+    """Public names, loaded when first used, so that importing the package stays quick."""
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(_import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOME_OF})

@@ -21,7 +21,6 @@ from jaxtyping import Array, Float
 
 from jaxmpc.blocking import (
     block_starts,
-    hard_rows,
     moves_per_block,
     oscillation_rows,
     single_step_blocks,

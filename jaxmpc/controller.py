@@ -13,14 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxmpc import qp as qp_solver
 from jaxmpc import status as codes
 from jaxmpc.blocking import block_members, hard_rows, moves_per_block, sample_moves
 from jaxmpc.condense import CondensedQp, condense, make_instance
 from jaxmpc.disturbance import filter_bias
 from jaxmpc.errors import InputError
 from jaxmpc.integer import FINISHES
+from jaxmpc.newton import WarmStart, warm_start_of
 from jaxmpc.plan import Plan, Planner, check_match, check_vector
+from jaxmpc.relaxation import cold_start, shifted_start, solve_relaxed
 from jaxmpc.step_response import StepResponseModel, advance_free_response, shift_free_response
 from jaxmpc.structure import Structure
 from jaxmpc.tuning import Tuning
@@ -38,6 +39,7 @@ class ControllerState(eqx.Module):
         last_move: previous move [MV unit].
         past_moves: the last `mean_move_window` moves, oldest first [MV unit].
         plan: the previous plan shifted by one sample, block moves [MV unit].
+        warm: moves and prices of the previous relaxation, shifted; where the next solve starts.
     """
 
     base: Float[Array, " cv"]
@@ -48,6 +50,7 @@ class ControllerState(eqx.Module):
     last_move: Float[Array, " mv"]
     past_moves: Float[Array, "window mv"]
     plan: Float[Array, "block mv"]
+    warm: WarmStart
 
 
 class StepInfo(eqx.Module):
@@ -61,7 +64,7 @@ class StepInfo(eqx.Module):
         fallback: the MVs were held because there was no plan.
         recovering: an MV was outside its limits and is being brought back.
         objective, bound, gap: value of the plan (6.6), proven bound, relative gap; not a number without a plan.
-        nodes: relaxations solved (interior-point iterations of the one relaxation for continuous moves).
+        nodes: relaxations solved (iterations of the one relaxation for continuous moves).
         finished_by: code of `jaxmpc.status.FINISHERS`.
         solve_time: wall time of the solve [s]; not a number inside a compiled loop, which has no clock.
     """
@@ -87,12 +90,13 @@ class _Memory(eqx.Module):
     tuning: Tuning
     coefficients: Float[Array, "cv mv future"]
 
-    def init(self, cv: Float[Array, " cv"], mv: Float[Array, " mv"]) -> ControllerState:
+    def init(self, cv: Float[Array, " cv"], mv: Float[Array, " mv"], warm: WarmStart) -> ControllerState:
         """State of a controller that starts in a steady state.
 
         Args:
             cv: measured CVs [CV unit].
             mv: present MVs [MV unit].
+            warm: where the first solve starts.
         """
         s = self.structure
         zeros = lambda *shape: jnp.zeros(shape)  # noqa: E731
@@ -105,6 +109,7 @@ class _Memory(eqx.Module):
             last_move=zeros(s.mv_count),
             past_moves=zeros(s.mean_move_window, s.mv_count),
             plan=zeros(s.block_count, s.mv_count),
+            warm=warm,
         )
 
     def observe(self, state: ControllerState, cv) -> tuple[ControllerState, Float[Array, "horizon cv"]]:
@@ -123,8 +128,8 @@ class _Memory(eqx.Module):
         state = eqx.tree_at(lambda s: (s.bias, s.bias_raw, s.future), state, (bias, raw, future))
         return state, state.base + future[:, : self.structure.prediction_horizon].T + bias
 
-    def remember(self, state: ControllerState, move, moves) -> ControllerState:
-        """Apply a move: predictions, history, and the plan shifted by one sample."""
+    def remember(self, state: ControllerState, move, moves, warm: WarmStart) -> ControllerState:
+        """Apply a move: predictions, history, and plan and prices shifted by one sample."""
         return ControllerState(
             base=state.base,
             future=advance_free_response(state.future, self.coefficients, move),
@@ -134,6 +139,7 @@ class _Memory(eqx.Module):
             last_move=move,
             past_moves=jnp.concatenate([state.past_moves[1:], move[None]]),
             plan=shift_plan(self.structure, moves),
+            warm=shifted_start(warm, self.structure.cv_count, self.structure.horizon_count),
         )
 
 
@@ -192,7 +198,7 @@ class ContinuousController(eqx.Module):
 
     def init(self, cv: Float[Array, " cv"], mv: Float[Array, " mv"]) -> ControllerState:
         """State at a steady state with measured CVs and present MVs (engineering units)."""
-        return self.memory.init(cv, mv)
+        return self.memory.init(cv, mv, cold_start(self.qp, len(hard_rows(self.structure))))
 
     def step(
         self, state: ControllerState, cv: Float[Array, " cv"], setpoint: Float[Array, " cv"]
@@ -217,7 +223,9 @@ class ContinuousController(eqx.Module):
             past_moves=state.past_moves,
             recover=True,
         )
-        solution = qp_solver.solve(self.qp, hard_rows(structure), instance, instance.lower, instance.upper)
+        solution = solve_relaxed(
+            self.qp, hard_rows(structure), instance, instance.lower, instance.upper, state.warm
+        )
         moves = (solution.x * self.qp.scale).reshape(structure.mv_count, -1).T
         objective = solution.objective
         bound = jnp.minimum(jnp.maximum(solution.bound, 0.0), objective)
@@ -240,7 +248,8 @@ class ContinuousController(eqx.Module):
         move = jnp.where(good, move, 0.0)
         moves = jnp.where(good, moves, 0.0)
         recovering = outside_limits(tuning, state.mv)
-        state = self.memory.remember(state, move, moves)
+        warm = jax.tree.map(lambda new, old: jnp.where(good, new, old), warm_start_of(solution), state.warm)
+        state = self.memory.remember(state, move, moves, warm)
         missing = lambda value: jnp.where(good, value, jnp.nan)  # noqa: E731
         info = StepInfo(
             move=move,
@@ -310,7 +319,8 @@ class MixedIntegerController:
         """State at a steady state with measured CVs and present MVs (engineering units)."""
         check_vector("cv", cv, self.structure.cv_names, "CV unit")
         check_vector("mv", mv, self.structure.mv_names, "MV unit")
-        return self.memory.init(cv, mv)
+        constants = self.planner.constants(1)
+        return self.memory.init(cv, mv, cold_start(constants.qp, len(constants.rows)))
 
     def step(self, state: ControllerState, cv, setpoint) -> tuple[ControllerState, StepInfo]:
         """One sample; arguments as in `ContinuousController.step`."""
@@ -325,6 +335,7 @@ class MixedIntegerController:
             previous_moves=state.plan,
             past_moves=state.past_moves,
             recover=True,
+            warm=state.warm,
             time_limit=self.time_limit,
             gap=self.gap,
             finish=self.finish,
@@ -339,7 +350,13 @@ class MixedIntegerController:
             else np.zeros_like(np.asarray(state.plan))
         )
         recovering = bool(outside_limits(self.tuning, state.mv))
-        state = _remember(self.memory, state, jnp.asarray(moves[0]), jnp.asarray(moves))
+        fits = (
+            plan is not None
+            and plan.warm is not None
+            and len(plan.warm.row_price) == len(state.warm.row_price)
+        )
+        warm = plan.warm if plan is not None and fits else state.warm
+        state = _remember(self.memory, state, jnp.asarray(moves[0]), jnp.asarray(moves), warm)
         number = lambda value: np.float64(np.nan if value is None else value)  # noqa: E731
         info = StepInfo(
             move=moves[0],
@@ -364,5 +381,5 @@ def _observe(memory: _Memory, state: ControllerState, cv):
 
 
 @eqx.filter_jit
-def _remember(memory: _Memory, state: ControllerState, move, moves):
-    return memory.remember(state, move, moves)
+def _remember(memory: _Memory, state: ControllerState, move, moves, warm):
+    return memory.remember(state, move, moves, warm)

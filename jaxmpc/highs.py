@@ -97,7 +97,7 @@ class ReducedMilp:
                     self._row(low - constant, high - constant, index, value)
 
     def add_cut(self, value: float, at: np.ndarray, gradient: np.ndarray) -> None:
-        """theta >= value + gradient'(d - at)."""
+        """Theta >= value + gradient'(d - at)."""
         index, slope, constant = self._in_binaries(gradient / self.unit)
         right = value / self.unit - gradient @ at / self.unit + constant
         self._row(right, np.inf, np.concatenate([[0], index]), np.concatenate([[1.0], -slope]))

@@ -15,14 +15,14 @@ import time
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc import qp as qp_solver
 from jaxmpc.blocking import hard_rows, moves_per_block
 from jaxmpc.condense import CondensedQp, QpInstance, integer_columns
 from jaxmpc.levelset import LowerModel, enumerate_below, exclude, schur_complement
+from jaxmpc.newton import WarmStart, warm_start_of
 from jaxmpc.propagation import Chain, chains_of, nearest, propagate, satisfied
+from jaxmpc.relaxation import cold_start, solve_relaxed
 from jaxmpc.status import FAILED, INFEASIBLE, LIMIT, OPTIMAL
 from jaxmpc.structure import Structure
 
@@ -35,16 +35,16 @@ FINISHES = ("auto", "enumeration", "highs", "branch-and-bound")
 
 
 @eqx.filter_jit
-def _relax(qp: CondensedQp, rows, instance: QpInstance, lower, upper):
+def _relax(qp: CondensedQp, rows, instance: QpInstance, lower, upper, starts: WarmStart):
     """Batched relaxation; returns only what the search reads."""
     predictions = instance.limit_high.shape[0]
 
-    def lane(low, high):
-        s = qp_solver.solve(qp, rows, instance, low, high)
+    def lane(low, high, start):
+        s = solve_relaxed(qp, rows, instance, low, high, start)
         envelope = s.row_price[predictions:]
-        return s.x, s.objective, s.bound, s.status, s.lower_price - s.upper_price, envelope
+        return s.x, s.objective, s.bound, s.status, s.lower_price - s.upper_price, envelope, warm_start_of(s)
 
-    return jax.vmap(lane)(lower, upper)
+    return jax.vmap(lane)(lower, upper, starts)
 
 
 @dataclasses.dataclass
@@ -57,6 +57,11 @@ class Relaxations:
     status: np.ndarray
     gradient: np.ndarray
     envelope: np.ndarray
+    warm: WarmStart
+
+    def start(self, lane: int) -> WarmStart:
+        """Moves and prices of one lane, to start its neighbours from."""
+        return jax.tree.map(lambda leaf: leaf[lane], self.warm)
 
 
 class Constants:
@@ -83,7 +88,7 @@ class Constants:
 
 @dataclasses.dataclass
 class SearchResult:
-    """Outcome of an integer solve: scaled moves, value, bound, status code, who finished, nodes."""
+    """Outcome of an integer solve: scaled moves, value, bound, status code, who finished, nodes, root prices."""
 
     x: np.ndarray | None
     value: float
@@ -91,6 +96,7 @@ class SearchResult:
     status: int
     finished_by: str | None
     nodes: int
+    root: WarmStart | None = None
 
 
 class Search:
@@ -114,6 +120,7 @@ class Search:
         self.root_bound = 0.0  # every term of (6.6) is non-negative
         self.nodes = 0
         self.seen: set[bytes] = set()
+        self.start = jax.tree.map(np.asarray, cold_start(constants.qp, len(constants.rows)))
         self.lanes = BATCH if len(self.limits[0]) <= WIDE else 1
 
     # ---- bookkeeping
@@ -140,19 +147,28 @@ class Search:
         self.left_out = min(self.left_out, bound)
 
     # ---- batched relaxations
-    def relax(self, lower: np.ndarray, upper: np.ndarray) -> Relaxations:
-        """Solve relaxed problems with integer limits ``"batch integer"``, one by one or in padded batches of one size."""
+    def relax(
+        self, lower: np.ndarray, upper: np.ndarray, starts: list[WarmStart] | None = None
+    ) -> Relaxations:
+        """Solve relaxed problems with integer limits ``"batch integer"``, one by one or in padded batches of one size.
+
+        Args:
+            lower: integer lower limits.
+            upper: integer upper limits.
+            starts: prices to start from, one per problem; the root's if not given.
+        """
         count, parts = len(lower), []
         wide_low, wide_high = (np.repeat(v[None], count, axis=0) for v in self.limits)
         wide_low[:, self.constants.integer], wide_high[:, self.constants.integer] = lower, upper
+        starts = [self.start] * count if starts is None else starts
         size = 1 if count < SINGLE else self.lanes
         qp = self.constants.lean if size == 1 else self.constants.qp
-        for start in range(0, count, size):
-            low, high = wide_low[start : start + size], wide_high[start : start + size]
-            pad = np.minimum(np.arange(size), len(low) - 1)
-            out = _relax(qp, self.constants.rows, self.instance, low[pad], high[pad])
-            parts.append([np.asarray(v)[: len(low)] for v in out])
-        return Relaxations(*(np.concatenate(v) for v in zip(*parts, strict=True)))
+        for first in range(0, count, size):
+            pad = np.minimum(first + np.arange(size), count - 1)
+            stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *(starts[i] for i in pad))
+            out = _relax(qp, self.constants.rows, self.instance, wide_low[pad], wide_high[pad], stacked)
+            parts.append(jax.tree.map(lambda v, n=min(size, count - first): np.asarray(v)[:n], out))
+        return Relaxations(*jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts))
 
     def evaluate(self, points: np.ndarray, bounds: np.ndarray | None = None) -> Relaxations:
         """Solve the problems with the whole moves fixed, take the best as incumbent, discard the rest."""
@@ -208,7 +224,13 @@ class Search:
             return SearchResult(None, np.inf, np.inf if by else bound, status, by, self.nodes)
         closed = self.value - bound <= max(self.gap, 1e-9) * self.reference
         return SearchResult(
-            self.x, self.value, bound, OPTIMAL if closed else LIMIT, by if closed else None, self.nodes
+            self.x,
+            self.value,
+            bound,
+            OPTIMAL if closed else LIMIT,
+            by if closed else None,
+            self.nodes,
+            self.start,
         )
 
 
@@ -217,6 +239,7 @@ def solve_integer(
     instance: QpInstance,
     *,
     starts: list[np.ndarray] | None = None,
+    warm: WarmStart | None = None,
     gap: float = 1e-6,
     time_limit: float | None = None,
     finish: str = "auto",
@@ -227,6 +250,7 @@ def solve_integer(
         constants: of the structure, model and tuning.
         instance: the problem of this sample.
         starts: moves of integer MVs to try as incumbents ``"integer"`` [steps]; rounded and repaired here.
+        warm: prices of a neighbouring problem's root relaxation; speeds the solve up, never changes the answer.
         gap: relative gap at which the solve stops.
         time_limit: seconds; the best plan so far is returned with its true gap.
         finish: ``auto``, or the one path that has to close the problem after fixing.
@@ -248,7 +272,8 @@ def solve_integer(
     zero = np.zeros(len(integer))
     if search.rounded(zero, lower, upper) is None and nearest(search.chains, zero, lower, upper) is None:
         return SearchResult(None, np.inf, np.inf, INFEASIBLE, None, 0)
-    root = search.relax(lower[None], upper[None])
+    root = search.relax(lower[None], upper[None], None if warm is None else [warm])
+    search.start = root.start(0)
     search.nodes = 1
     root_bound = search.root_bound = max(float(root.bound[0]), 0.0)
     # the rounded relaxation is optimal nearly always; the others are tried only if it does not close the problem
@@ -430,7 +455,7 @@ def _branch_and_bound(search: Search, root: Relaxations, lower, upper, root_boun
         np.round(search.limits[0][c.integer]).astype(int),
         np.round(search.limits[1][c.integer]).astype(int),
     )
-    heap = [(root_bound, next(counter), lower, upper, model, root.x[0, c.integer])]
+    heap = [(root_bound, next(counter), lower, upper, model, root.x[0, c.integer], root.start(0))]
     while heap:
         if heap[0][0] >= search.cutoff:
             search.discard(heap[0][0])
@@ -439,20 +464,21 @@ def _branch_and_bound(search: Search, root: Relaxations, lower, upper, root_boun
             return heap[0][0]
         children = []
         while heap and len(children) < max(search.lanes - 1, 1):
-            bound, _, low, high, model, center = heapq.heappop(heap)
+            bound, _, low, high, model, center, start = heapq.heappop(heap)
             if bound >= search.cutoff:
                 search.discard(bound)
                 continue
-            children += _split(search, bound, low, high, model, center)
+            children += [(*child, start) for child in _split(bound, low, high, model, center)]
         if not children:
             continue
         low, high = np.array([ch[1] for ch in children]), np.array([ch[2] for ch in children])
         low, high, possible = propagate(search.chains, low, high)
         bounds = np.array([ch[0] for ch in children])
         low, high, bounds = low[possible], high[possible], bounds[possible]
+        starts = [child[3] for child, keep in zip(children, possible, strict=True) if keep]
         if not len(low):
             continue
-        result = search.relax(low, high)
+        result = search.relax(low, high, starts)
         search.nodes += len(low)
         leaf = (low == high).all(axis=1)
         candidates = []
@@ -483,12 +509,13 @@ def _branch_and_bound(search: Search, root: Relaxations, lower, upper, root_boun
                     tight_high[0],
                     model,
                     result.x[i, c.integer],
+                    result.start(i),
                 )
                 heapq.heappush(heap, entry)
     return np.inf
 
 
-def _split(search: Search, bound: float, low, high, model: LowerModel, center) -> list[tuple]:
+def _split(bound: float, low, high, model: LowerModel, center) -> list[tuple]:
     """Two children of a node, on the move whose better side costs most by the node's own prices."""
     free = np.flatnonzero(high > low)
     if not len(free):

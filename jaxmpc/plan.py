@@ -15,10 +15,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmpc import status as codes
-from jaxmpc.blocking import moves_per_block, position_rows, sample_moves
+from jaxmpc.blocking import moves_per_block, sample_moves
 from jaxmpc.condense import DRIFT, QpInstance, condense, dynamic_matrix, integer_columns, make_instance
 from jaxmpc.errors import InputError
-from jaxmpc.integer import FINISHES, Constants, SearchResult, Search, continuous_feasible, solve_integer
+from jaxmpc.integer import FINISHES, Constants, Search, SearchResult, continuous_feasible, solve_integer
+from jaxmpc.newton import WarmStart
 from jaxmpc.step_response import StepResponseModel
 from jaxmpc.structure import Structure
 from jaxmpc.tuning import Tuning
@@ -42,6 +43,7 @@ class Plan:
         nodes: relaxations solved in the search.
         solve_time_s: wall time of the solve [s].
         finished_by: which path closed the problem, None if none did.
+        warm: prices of the root relaxation, a start for the next sample.
     """
 
     status: str
@@ -56,6 +58,7 @@ class Plan:
     nodes: int
     solve_time_s: float
     finished_by: str | None
+    warm: WarmStart | None = None
 
 
 @functools.partial(eqx.filter_jit)
@@ -116,6 +119,7 @@ class Planner:
         previous_moves=None,
         past_moves=None,
         recover: bool = False,
+        warm: WarmStart | None = None,
         time_limit: float | None = None,
         gap: float = 1e-6,
         finish: str = "auto",
@@ -130,6 +134,7 @@ class Planner:
             previous_moves: start, ``"block mv"``, or None.
             past_moves: moves of the mean-move window, ``"window mv"`` oldest first, or None.
             recover: let MVs outside their limits return the shortest way.
+            warm: `Plan.warm` of a neighbouring step; ignored where its size does not fit.
             time_limit: seconds, None for none.
             gap: relative gap.
             finish: one of `integer.FINISHES`.
@@ -174,7 +179,15 @@ class Planner:
             wanted = (as_array(previous_moves) / scale).T.reshape(-1)[integer]
             starts.append(np.clip(np.nan_to_num(wanted), -1e6, 1e6))
         result = (
-            solve_integer(constants, instance, starts=starts, gap=gap, time_limit=time_limit, finish=finish)
+            solve_integer(
+                constants,
+                instance,
+                starts=starts,
+                warm=_fitting(warm, constants),
+                gap=gap,
+                time_limit=time_limit,
+                finish=finish,
+            )
             if len(integer)
             else self._solve_relaxed(constants, instance, gap)
         )
@@ -250,6 +263,7 @@ class Planner:
             nodes=result.nodes,
             solve_time_s=elapsed(),
             finished_by=result.finished_by if state == codes.OPTIMAL else None,
+            warm=result.root,
         )
 
     def objective(
@@ -280,6 +294,11 @@ class Planner:
             + (np.asarray(tuning.slack_weight) * (eps_high + eps_low)).sum()
         )
         return float(value), cv, (eps_high, eps_low)
+
+
+def _fitting(warm: WarmStart | None, constants: Constants) -> WarmStart | None:
+    """The start if it has as many rows as the problem (wider integer ranges have more), else None."""
+    return warm if warm is not None and len(warm.row_price) == constants.qp.theta.shape[0] else None
 
 
 def _padded(instance: QpInstance, constants: Constants) -> QpInstance:

@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxmpc.condense import CondensedQp, QpInstance
 from jaxmpc.status import FAILED, OPTIMAL
@@ -84,7 +84,7 @@ def solver_unit(qp: CondensedQp, instance: QpInstance) -> Float[Array, ""]:
 
 
 def _limit_cost(qp: CondensedQp, instance: QpInstance, t):
-    """rho times the largest violation per CV and side, high sides first."""
+    """Rho times the largest violation per CV and side, high sides first."""
     if not qp.has_limits:
         return jnp.zeros(1)
     cvs = qp.slack_weight.shape[0]
@@ -152,6 +152,9 @@ def solve(
     instance: QpInstance,
     lower: Float[Array, " n"],
     upper: Float[Array, " n"],
+    *,
+    skip: Bool[Array, ""] | None = None,
+    tolerance: float = TOLERANCE,
 ) -> QpSolution:
     """Solve one relaxed problem (one lane; use `jax.vmap` for a batch).
 
@@ -160,6 +163,8 @@ def solve(
         rows: hard rows, `blocking.hard_rows(structure)`.
         instance: offsets and limits of this sample.
         lower, upper: limits of x that replace the instance's (a search tightens them); equal limits fix a move.
+        skip: do not iterate (the lane is solved already, its result is not used).
+        tolerance: of the scaled residuals and the relative gap.
 
     Returns:
         `QpSolution`; a lane that did not converge has status `FAILED` and still a valid bound.
@@ -292,7 +297,7 @@ def solve(
         primal=primal,
         dual=dual_residual(x, price_vector),
         iterations=jnp.zeros((), dtype=jnp.int32),
-        residual=jnp.asarray(jnp.inf),
+        residual=jnp.asarray(jnp.inf) if skip is None else jnp.where(skip, 0.0, jnp.inf),
         best=jnp.asarray(jnp.inf),
         stalled=jnp.zeros((), dtype=jnp.int32),
     )
@@ -402,7 +407,7 @@ def solve(
 
     def unfinished(state: _State):
         patience = jnp.where(state.best < ROUNDING, 3, PATIENCE)
-        return (state.residual > TOLERANCE) & (state.iterations < MAX_ITERATIONS) & (state.stalled < patience)
+        return (state.residual > tolerance) & (state.iterations < MAX_ITERATIONS) & (state.stalled < patience)
 
     state = jax.lax.while_loop(unfinished, iterate, start)
     x = jnp.where(free, jnp.clip(state.x, lower, upper), fixed_value)
