@@ -7,6 +7,8 @@ gives no plan holds the MVs, and the info says so.
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -358,7 +360,7 @@ class MixedIntegerController:
         warm = plan.warm if plan is not None and fits else state.warm
         state = _remember(self.memory, state, jnp.asarray(moves[0]), jnp.asarray(moves), warm)
         number = lambda value: np.float64(np.nan if value is None else value)  # noqa: E731
-        info = StepInfo(
+        values: dict[str, Any] = dict(  # on the host: NumPy where the compiled controller has JAX arrays
             move=moves[0],
             mv=np.asarray(state.mv),
             moves=moves,
@@ -372,7 +374,7 @@ class MixedIntegerController:
             finished_by=np.int64(codes.finisher_code(plan.finished_by if plan else None)),
             solve_time=number(plan.solve_time_s if plan else None),
         )
-        return state, info
+        return state, StepInfo(**values)
 
 
 @eqx.filter_jit

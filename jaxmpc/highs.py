@@ -100,7 +100,7 @@ class ReducedMilp:
         """Theta >= value + gradient'(d - at)."""
         index, slope, constant = self._in_binaries(gradient / self.unit)
         right = value / self.unit - gradient @ at / self.unit + constant
-        self._row(right, np.inf, np.concatenate([[0], index]), np.concatenate([[1.0], -slope]))
+        self._row(float(right), np.inf, np.concatenate([[0], index]), np.concatenate([[1.0], -slope]))
 
     def forbid(self, point: np.ndarray) -> None:
         """No-good cut: at least one free move differs from `point`."""

@@ -126,7 +126,7 @@ def enumerate_below(
     for i in range(count):
         chain, b = owner[i]
         column = order[i]
-        domain = np.arange(lower[column], upper[column] + 1)
+        domain = np.arange(int(lower[column]), int(upper[column]) + 1)
         parents = np.repeat(np.arange(len(moves)), len(domain))
         value = np.tile(domain, len(moves))
         moves, bounds = moves[parents], bounds[parents]
@@ -159,4 +159,4 @@ def _leading_factor(matrix: np.ndarray) -> np.ndarray:
     """Lower-triangular R with R'R = matrix, so that term i of |R d|^2 involves d_0..d_i only."""
     values, vectors = np.linalg.eigh(matrix)
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-    return np.linalg.qr(root[:, ::-1], mode="r")[::-1, ::-1]
+    return np.asarray(np.linalg.qr(root[:, ::-1], mode="r"))[::-1, ::-1]

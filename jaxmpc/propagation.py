@@ -94,7 +94,7 @@ def propagate(
             break
         if (lower > upper).any(axis=1).all():
             break
-    return lower, upper, (lower <= upper).all(axis=1)
+    return lower, upper, np.asarray((lower <= upper).all(axis=1))
 
 
 def _sweep(chain: Chain, lower: np.ndarray, upper: np.ndarray) -> None:
@@ -139,7 +139,7 @@ def satisfied(chains: list[Chain], moves: np.ndarray, lower: np.ndarray, upper: 
         if len(chain.windows):
             total = own @ chain.windows.T
             good &= ((total >= chain.window_low - 1e-6) & (total <= chain.window_high + 1e-6)).all(axis=1)
-    return good
+    return np.asarray(good)
 
 
 def nearest(
@@ -147,8 +147,8 @@ def nearest(
 ) -> np.ndarray | None:
     """Feasible whole moves closest to `wanted` in the sum of absolute differences, or None where there are none.
 
-    Window rows are not looked at. Dynamic programming over (position, last move), exact; costs milliseconds and is called only when rounding
-    breaks a hard row.
+    Window rows are not looked at. Dynamic programming over (position, last move), exact; costs milliseconds and is
+    called only when rounding breaks a hard row.
     """
     result = np.zeros(len(wanted), dtype=int)
     for chain in chains:

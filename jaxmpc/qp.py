@@ -135,7 +135,7 @@ class _Layout:
         )
         ends = np.cumsum(sizes)
         self.parts = {k: slice(e - size, e) for k, size, e in zip(names, sizes, ends, strict=True)}
-        self.sizes = dict(zip(names, sizes, strict=True))
+        self.sizes: dict[str, int] = dict(zip(names, sizes, strict=True))
 
     def split(self, vector) -> dict[str, Array]:
         """Families of a vector."""

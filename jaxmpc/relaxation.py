@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from jaxmpc.condense import CondensedQp, QpInstance
 from jaxmpc.newton import WarmStart, certified, refine, warm_start_of
 from jaxmpc.qp import QpSolution, solve
-from jaxmpc.status import OPTIMAL
+from jaxmpc.status import FAILED, OPTIMAL
 
 ROUGH = 1e-8  # relative gap at which the interior point stops
 ENOUGH = 3e-8  # relative gap up to which its result needs no Newton finish
@@ -44,18 +44,35 @@ def solve_relaxed(
         else `FAILED`; `iterations` counts both methods, `residual` is the larger of gap and violation.
     """
     judge = lambda s, gap: certified(qp, rows, instance, s, lower, upper, gap)  # noqa: E731
-    if start is None:
-        result = judge(solve(qp, rows, instance, lower, upper, tolerance=ROUGH), ENOUGH)
-    else:
-        warm = refine(qp, rows, instance, lower, upper, start)
-        done = warm.status == OPTIMAL
-        cold = judge(solve(qp, rows, instance, lower, upper, skip=done, tolerance=ROUGH), ENOUGH)
-        result = _choose(done, warm, cold)
-    done = result.status == OPTIMAL
-    finish = refine(qp, rows, instance, lower, upper, warm_start_of(result), skip=done)
-    better = ~done & jnp.isfinite(finish.residual) & (finish.residual < result.residual)
-    result = _choose(~better, result, finish)
-    return judge(result, ACCEPTED)
+
+    def attempt(carry):
+        round_, best, start = carry
+        known = best.status == OPTIMAL
+        newton = refine(qp, rows, instance, lower, upper, start, skip=known)
+        best = _choose(known | ~(newton.residual < best.residual), best, newton)
+        # the interior point follows a first attempt only; a second one starts from its result
+        skip = (best.status == OPTIMAL) | (round_ > 0)
+        cold = judge(solve(qp, rows, instance, lower, upper, skip=skip, tolerance=ROUGH), ENOUGH)
+        best = _choose(skip | ~(cold.residual < best.residual), best, cold)
+        return round_ + 1, best, warm_start_of(best)
+
+    first = start if start is not None else cold_start(qp, len(rows))
+    shape = jax.eval_shape(lambda: refine(qp, rows, instance, lower, upper, first))
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
+    nothing = eqx.tree_at(
+        lambda s: (s.status, s.residual, s.bound, s.objective),
+        nothing,
+        (
+            jnp.full_like(nothing.status, FAILED),
+            *(jnp.full_like(nothing.bound, v) for v in (np.inf, -np.inf, np.inf)),
+        ),
+    )
+    _, best, _ = jax.lax.while_loop(
+        lambda carry: (carry[0] < 2) & (carry[1].status != OPTIMAL),
+        attempt,
+        (jnp.zeros((), dtype=jnp.int32), nothing, first),
+    )
+    return judge(best, ACCEPTED)
 
 
 def _choose(first_is_taken, first: QpSolution, second: QpSolution) -> QpSolution:

@@ -131,7 +131,7 @@ def make_model(
     try:
         array = np.array(coefficients, dtype=np.float64)
     except (ValueError, TypeError):
-        array = np.empty(0)
+        array = np.array([])
     expected = f"[cv][mv][n] = [{len(cv_names)}][{len(mv_names)}][N >= 1] numbers of equal length N"
     if array.ndim != 3 or array.shape[:2] != (len(cv_names), len(mv_names)) or array.shape[2] < 1:
         raise InputError(f"{path}.coefficients", f"shape {list(array.shape)}", expected)

@@ -268,9 +268,12 @@ def full_form(case: dict) -> FullForm:
     n = read(case)
     horizon = n.hp - n.hw + 1
     units = np.ones(n.mvs)
+    away = np.abs(n.free - n.r).max(axis=0) + n.c
     for m in range(n.mvs):
-        spans = [abs(x) for x in (n.dlo[m], n.dhi[m]) if math.isfinite(x) and x] or [n.uhi[m] - n.ulo[m]]
-        units[m] = n.step[m] or (max(spans) if 0 < max(spans) < math.inf else 1.0)
+        limits = [abs(x) for x in (n.dlo[m], n.dhi[m], n.uhi[m] - n.ulo[m]) if math.isfinite(x) and x]
+        gains = np.abs(n.S[:, m]).max(axis=1)
+        reach = [d / g for d, g in zip(away, gains, strict=True) if d * g > 0]  # where nothing limits the MV
+        units[m] = n.step[m] or (max(limits[:2]) if limits else min(reach, default=1.0))
     size = np.einsum("cmj,m->cmj", np.abs(n.S), units).max(axis=(1, 2))
     size[size == 0] = 1.0
 
@@ -576,10 +579,13 @@ FLOOR = 1e-3  # costs below it are compared absolutely: random cases have costs 
 
 
 def best_qp(case: dict) -> Answer:
-    """The relaxed problem by two interior-point solvers, the better of both."""
+    """The relaxed problem by two interior-point solvers, and an active-set one where it is small: the best."""
     if not hard_feasible(case):
         return Answer("infeasible")
-    return min((solve_qp(case, "clarabel"), solve_qp(case, "piqp")), key=lambda answer: answer.objective)
+    form = full_form(case)
+    solvers = ("clarabel", "piqp", "daqp") if len(form.q) < 300 else ("clarabel", "piqp")
+    answers = [solve_qp(case, solver, form=form) for solver in solvers]
+    return min(answers, key=lambda answer: answer.objective)
 
 
 def complaints(case: dict, plan, reference: Answer) -> list[str]:

@@ -81,7 +81,8 @@ def test_whole_moves_never_reverse_at_once_and_stay_on_the_step(
     steps = np.array([info.move[0] for info in infos]) / 2.0
     assert np.array_equal(steps, np.round(steps))
     assert np.abs(np.diff(steps)).max() <= 1
-    assert (steps > 0).any() and (steps < 0).any()
+    assert (steps > 0).any()
+    assert (steps < 0).any()
 
 
 def test_the_reactive_limit_stops_the_choke_once_its_mean_move_exceeds_it(

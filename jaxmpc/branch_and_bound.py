@@ -1,0 +1,117 @@
+"""Closing an integer problem by best-first branch and bound over relaxations, the last resort of `integer`.
+
+Every node tightens its limits by what its own prices exclude (`levelset`) and by the hard rows.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+
+import numpy as np
+
+from jaxmpc.levelset import LowerModel, exclude
+from jaxmpc.propagation import propagate, satisfied
+from jaxmpc.search import MANY, SINGLE, Relaxations, Search
+
+
+def branch_and_bound(search: Search, root: Relaxations, lower, upper, root_bound: float) -> float:
+    """Best-first branch and bound, a batch of nodes at a time; returns the least bound still open."""
+    c = search.constants
+    counter = itertools.count()
+    model = search.lower_model(
+        root,
+        0,
+        np.round(search.limits[0][c.integer]).astype(int),
+        np.round(search.limits[1][c.integer]).astype(int),
+    )
+    heap = [(root_bound, next(counter), lower, upper, model, root.x[0, c.integer], root.start(0))]
+    while heap:
+        if heap[0][0] >= search.cutoff:
+            search.discard(heap[0][0])
+            return np.inf
+        if search.out_of_time():
+            return heap[0][0]
+        children = []
+        width = SINGLE - 2 if search.nodes < MANY else max(search.lanes - 1, 1)
+        while heap and len(children) < min(width, max(search.lanes - 1, 1)):
+            bound, _, low, high, model, center, start = heapq.heappop(heap)
+            if bound >= search.cutoff:
+                search.discard(bound)
+                continue
+            children += [(*child, start) for child in _split(bound, low, high, model, center)]
+        if not children:
+            continue
+        low, high = np.array([ch[1] for ch in children]), np.array([ch[2] for ch in children])
+        low, high, possible = propagate(search.chains, low, high)
+        bounds = np.array([ch[0] for ch in children])
+        low, high, bounds = low[possible], high[possible], bounds[possible]
+        starts = [child[3] for child, keep in zip(children, possible, strict=True) if keep]
+        if not len(low):
+            continue
+        result = search.relax(low, high, starts)
+        search.nodes += len(low)
+        leaf = (low == high).all(axis=1)
+        candidates = []
+        for i in range(len(low)):
+            bounds[i] = max(bounds[i], float(result.bound[i]))
+            if leaf[i]:
+                if satisfied(search.chains, low[i : i + 1], low[i], high[i])[0]:
+                    search.seen.add(low[i].tobytes())
+                    if result.objective[i] < search.value:
+                        search.value, search.x = float(result.objective[i]), result.x[i]
+                    search.discard(float(min(bounds[i], result.objective[i])))
+            elif bounds[i] < search.cutoff:
+                candidates.append(search.rounded(result.x[i, c.integer], low[i], high[i]))
+        search.try_points(candidates[: SINGLE - 1])
+        for i in np.flatnonzero(~leaf):
+            if bounds[i] >= search.cutoff:
+                search.discard(float(bounds[i]))
+                continue
+            model = search.lower_model(result, i, low[i], high[i])
+            tight_low, tight_high = exclude(model, search.cutoff)
+            search.discard(max(float(bounds[i]), search.cutoff))
+            tight_low, tight_high, good = propagate(search.chains, tight_low[None], tight_high[None])
+            if good[0]:
+                entry = (
+                    float(bounds[i]),
+                    next(counter),
+                    tight_low[0],
+                    tight_high[0],
+                    model,
+                    result.x[i, c.integer],
+                    result.start(i),
+                )
+                heapq.heappush(heap, entry)
+    return np.inf
+
+
+def _split(bound: float, low, high, model: LowerModel, center) -> list[tuple]:
+    """Two children of a node, on the move whose better side costs most by the node's own prices."""
+    free = np.flatnonzero(high > low)
+    if not len(free):
+        return [(bound, low, high)]
+    best, choice = -1.0, (free[0], low[free[0]])
+    for i in free:
+        values = np.arange(low[i], high[i] + 1)
+        away = values - center[i]
+        curve = 0.5 * away**2 / model.radius[i] if np.isfinite(model.radius[i]) else np.zeros(len(values))
+        cost = model.excess[i, values - model.lower[i]] + curve
+        cut = int(np.clip(np.floor(center[i] + 1e-9), low[i], high[i] - 1))
+        if (
+            abs(center[i] - np.round(center[i])) < 1e-6
+        ):  # whole already: separate the cheapest value from the rest
+            cut = int(np.clip(np.round(center[i]), low[i], high[i] - 1))
+        down, up = cost[values <= cut].min(), cost[values > cut].min()
+        score = min(down, up) * (1.0 + 1e-3) + 1e-3 * max(down, up)
+        if score > best:
+            best, choice = score, (i, cut)
+    i, cut = choice
+    left, right = high.copy(), low.copy()
+    left[i], right[i] = cut, cut + 1
+    values = np.arange(low[i], high[i] + 1)
+    cost = model.value + model.excess[i, values - model.lower[i]]
+    return [
+        (max(bound, cost[values <= cut].min()), low, left),
+        (max(bound, cost[values > cut].min()), right, high),
+    ]
