@@ -64,7 +64,7 @@ def branch_and_bound(search: Search, root: Relaxations, lower, upper, root_bound
             elif bounds[i] < search.cutoff:
                 candidates.append(search.rounded(result.x[i, c.integer], low[i], high[i]))
         search.try_points(candidates[: SINGLE - 1])
-        for i in np.flatnonzero(~leaf):
+        for i in map(int, np.flatnonzero(~leaf)):
             if bounds[i] >= search.cutoff:
                 search.discard(float(bounds[i]))
                 continue

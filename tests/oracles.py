@@ -382,8 +382,8 @@ def _rows(form: FullForm, fixed=None):
 def solve_qp(case: dict, solver: str = "clarabel", fixed=None, form: FullForm | None = None) -> Answer:
     """The relaxed problem, or the one with the integer moves fixed, by somebody else's QP solver.
 
-    The solvers run to 1e-10 in scaled units and `objective()` judges the plan. Over 3,000 random cases they
-    agreed to 1e-7 relative, but for one at 9e-7 and six where PIQP or DAQP gave up: take the best of two.
+    The solvers run to 1e-10 in scaled units and `objective()` judges the plan. Over 3,000 random cases all that
+    answered agreed to 1e-7 relative; PIQP gave up on four.
 
     Args:
         case: the content of a case file.

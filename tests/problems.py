@@ -306,6 +306,13 @@ def no_deadzone(case, rng):
 
 
 @twist
+def soft_weights_alone(case, rng):
+    """Neither tracking nor moves cost anything: flat inside the deadzone."""
+    for twist_name in ("no_cv_weight", "no_move_weight"):
+        TWISTS[twist_name](case, rng)
+
+
+@twist
 def no_cost_at_all(case, rng):
     for twist_name in ("no_cv_weight", "no_move_weight", "without_soft_mpc", "free_slack"):
         TWISTS[twist_name](case, rng)

@@ -1,0 +1,145 @@
+"""Propagation, lower bounds and the paths of the integer search, against brute force on the same rows."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmpc import status
+from jaxmpc.condense import condense, make_instance
+from jaxmpc.integer import FINISHES, solve_integer
+from jaxmpc.levelset import enumerate_below, exclude
+from jaxmpc.propagation import Chain, nearest, propagate, satisfied
+from jaxmpc.search import Constants, Search
+
+NONE = np.zeros((0, 4)), np.zeros(0), np.zeros(0)
+
+
+def random_chain(rng):
+    low = rng.integers(-4, 1, size=4)
+    return Chain(
+        np.arange(4),
+        rng.integers(1, 4, size=4),
+        low,
+        low + rng.integers(0, 6, size=4),
+        np.array([False, *rng.integers(0, 2, size=3)], dtype=bool),
+        *NONE,
+    )
+
+
+def test_propagation_keeps_every_feasible_move_and_the_dynamic_programme_finds_the_nearest():
+    rng = np.random.default_rng(0)
+    feasible_seen = infeasible_seen = 0
+    for _ in range(300):
+        chain = random_chain(rng)
+        lower, upper = -rng.integers(0, 3, size=4), rng.integers(0, 3, size=4)
+        points = np.array(
+            list(itertools.product(*(range(a, b + 1) for a, b in zip(lower, upper, strict=True))))
+        )
+        good = points[satisfied([chain], points, lower, upper)]
+        tight_low, tight_high, possible = propagate([chain], lower[None], upper[None])
+        wanted = rng.normal(size=4) * 2
+        found = nearest([chain], wanted, lower, upper)
+        if len(good):
+            assert possible[0]
+            assert (good >= tight_low[0]).all()
+            assert (good <= tight_high[0]).all()
+            assert found is not None
+            assert np.abs(found - wanted).sum() == pytest.approx(np.abs(good - wanted).sum(axis=1).min())
+            feasible_seen += 1
+        else:
+            assert found is None
+            infeasible_seen += 1
+    assert min(feasible_seen, infeasible_seen) > 20
+
+
+@pytest.fixture(scope="module")
+def problems(small_structure, small_tuning, well_like_model):
+    """Twelve steps near, off and far from the setpoint, with all 3^6 whole plans solved for each."""
+    rng = np.random.default_rng(1)
+    constants = Constants(
+        small_structure, condense(small_structure, small_tuning, well_like_model.coefficients)
+    )
+    make = jax.jit(
+        lambda free, target, choke: make_instance(
+            small_structure,
+            small_tuning,
+            constants.qp,
+            free_response=free,
+            setpoint=target,
+            mv_now=jnp.stack([choke, 7500.0]),
+            last_move=jnp.asarray([2.0, 0.0]),
+        )
+    )
+    plans = np.array(list(itertools.product((-1, 0, 1), repeat=6)))
+    result = []
+    for k in range(12):
+        spread = (0.3, 1.0, 3.0)[k % 3]
+        free = np.array([11000.0, 185.0]) + np.cumsum(rng.normal(size=(40, 2)) * [60.0, 0.5], axis=0)
+        target = np.tile(np.array([11000.0, 185.0]) + spread * rng.normal(size=2) * [900.0, 9.0], (40, 1))
+        instance = make(free, target, float(rng.choice([0.0, 50.0, 98.0])))
+        search = Search(constants, instance, 1e-6, None)
+        low, high = (np.round(v[:6]).astype(int) for v in search.limits)
+        points = plans[satisfied(search.chains, plans, low, high)]
+        values = search.relax(points, points).objective
+        result.append((constants, instance, points, values))
+    return result
+
+
+def test_a_relaxed_solve_bounds_every_whole_plan_and_fixing_loses_no_better_one(problems):
+    excluded = 0
+    for constants, instance, points, values in problems:
+        search = Search(constants, instance, 1e-6, None)
+        low, high = (np.round(v[:6]).astype(int) for v in search.limits)
+        root = search.relax(low[None], high[None])
+        model = search.lower_model(root, 0, low, high)
+        away = points - model.center
+        bound = model.value + model.excess[np.arange(6), points - low].sum(axis=1)
+        bound = bound + 0.5 * np.einsum("pi,ij,pj->p", away, model.schur, away)
+        slack = 1e-7 * np.maximum(values, 1.0)  # objective and bound are each right to about 1e-8
+        assert (bound <= values + slack).all()
+        cutoff = np.partition(values, 5)[5]  # the sixth best plan as incumbent
+        tight_low, tight_high = exclude(model, cutoff)
+        better = points[values < cutoff - 1e-6 * cutoff]
+        assert (better >= tight_low).all()
+        assert (better <= tight_high).all()
+        excluded += int((tight_high - tight_low).sum() < (high - low).sum())
+        found, bounds, _ = enumerate_below(model, search.chains, tight_low, tight_high, cutoff, None)
+        assert {p.tobytes() for p in better} <= {p.tobytes() for p in found}
+        assert (np.diff(bounds) >= 0).all()
+    assert excluded > 6
+
+
+@pytest.mark.parametrize("finish", FINISHES)
+def test_every_path_finds_the_best_whole_plan_and_proves_it(problems, finish):
+    for constants, instance, _, values in problems:
+        result = solve_integer(constants, instance, finish=finish)
+        best = values.min()
+        assert result.status == status.OPTIMAL
+        assert result.value == pytest.approx(best, rel=1e-6)
+        assert result.bound <= best * (1 + 1e-8)
+        if finish != "auto":
+            assert result.finished_by == finish
+
+
+def test_a_start_or_prices_from_elsewhere_never_change_the_answer(problems):
+    rng = np.random.default_rng(2)
+    other = solve_integer(*problems[0][:2]).root
+    for constants, instance, _, values in problems[1:6]:
+        starts = [rng.normal(size=6) * 5]
+        result = solve_integer(constants, instance, starts=starts, warm=other)
+        assert result.status == status.OPTIMAL
+        assert result.value == pytest.approx(values.min(), rel=1e-6)
+
+
+def test_an_expired_time_limit_returns_a_feasible_plan_with_its_true_gap(problems):
+    seen = set()
+    for constants, instance, _, values in problems:
+        result = solve_integer(constants, instance, time_limit=0.0, finish="branch-and-bound")
+        assert result.x is not None
+        assert result.value >= values.min() * (1 - 1e-8)
+        assert result.bound <= values.min() * (1 + 1e-8)
+        seen.add(result.status)
+    assert status.LIMIT in seen
