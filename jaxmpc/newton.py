@@ -26,7 +26,7 @@ STEPS = 14  # Newton steps after which a start is given up
 PENALTY = 1e4  # curvature of a proximal term against the largest of the Hessian
 CLOSED = 1e-9  # relative duality gap of a finished solve
 FEASIBLE = 1e-8  # hard rows and limits, in scaled moves
-LEAST_SHARE = 1e-5  # of the solver unit: objectives below it have their gap measured against it
+LEAST_SHARE = 1e-7  # of the solver unit: objectives below it have their gap measured against it
 SEARCHES = 6  # secant steps of the line search
 
 

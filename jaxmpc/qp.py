@@ -79,8 +79,17 @@ def evaluate(qp: CondensedQp, instance: QpInstance, x: Float[Array, " n"]) -> Fl
 
 def solver_unit(qp: CondensedQp, instance: QpInstance) -> Float[Array, ""]:
     """What the solvers divide the objective by, so that curvatures and prices are of the order of one."""
-    unit = jnp.maximum(jnp.max(jnp.diagonal(qp.curvature)), 1e-12)
-    return jnp.maximum(unit, 1e-2 * jnp.max(jnp.abs(2.0 * (qp.quadratic * instance.offset) @ qp.theta)))
+    theta, offset = jnp.abs(qp.theta), instance.offset
+    beyond = jnp.maximum(jnp.abs(offset) - qp.deadzone, 0.0)
+    bent = 2.0 * qp.soft_quadratic @ theta**2  # curvature outside the deadzones
+    steep = jnp.abs(2.0 * (qp.quadratic * offset) @ qp.theta)
+    steep += (qp.soft_linear + 2.0 * qp.soft_quadratic * beyond) @ theta
+    unit = jnp.maximum(jnp.max(jnp.diagonal(qp.curvature) + bent), 1e-2 * jnp.max(steep))
+    if qp.has_limits:
+        predictions = instance.limit_high.shape[0]
+        reach = jnp.max(theta[:predictions].reshape(qp.slack_weight.shape[0], -1), axis=1)
+        unit = jnp.maximum(unit, 1e-3 * jnp.max(qp.slack_weight * reach))
+    return jnp.where(unit > 0.0, unit, 1.0)
 
 
 def _limit_cost(qp: CondensedQp, instance: QpInstance, t):
@@ -109,6 +118,9 @@ class _State(NamedTuple):
     iterations: Array
     residual: Array
     best: Array
+    best_x: Array
+    best_price: Array
+    best_residual: Array
     stalled: Array
 
 
@@ -299,6 +311,9 @@ def solve(
         iterations=jnp.zeros((), dtype=jnp.int32),
         residual=jnp.asarray(jnp.inf) if skip is None else jnp.where(skip, 0.0, jnp.inf),
         best=jnp.asarray(jnp.inf),
+        best_x=x,
+        best_price=price_vector,
+        best_residual=jnp.asarray(jnp.inf),
         stalled=jnp.zeros((), dtype=jnp.int32),
     )
 
@@ -399,24 +414,30 @@ def solve(
             dual=dual,
             iterations=state.iterations + 1,
             residual=worst,
-            best=jnp.where(better, merit, state.best),
+            best=jnp.minimum(merit, state.best),
+            best_x=jnp.where(merit < state.best, x, state.best_x),
+            best_price=jnp.where(merit < state.best, price, state.best_price),
+            best_residual=jnp.where(merit < state.best, worst, state.best_residual),
             stalled=jnp.where(better, 0, state.stalled + 1),
         )
         after = jax.tree.map(lambda new, old: jnp.where(moved, new, old), after, state)
         return after._replace(iterations=jnp.where(moved, after.iterations, MAX_ITERATIONS))
 
     def unfinished(state: _State):
-        patience = jnp.where(state.best < ROUNDING, 3, PATIENCE)
+        patience = jnp.where((state.best < ROUNDING) | (state.best_residual <= ACCEPTABLE), 3, PATIENCE)
         return (state.residual > tolerance) & (state.iterations < MAX_ITERATIONS) & (state.stalled < patience)
 
     state = jax.lax.while_loop(unfinished, iterate, start)
-    x = jnp.where(free, jnp.clip(state.x, lower, upper), fixed_value)
-    price = layout.split(unit * state.price)
+    # rounding can undo the last iterations of a degenerate problem: the best one is returned
+    x = jnp.where(free, jnp.clip(state.best_x, lower, upper), fixed_value)
+    price = layout.split(unit * state.best_price)
     solution = QpSolution(
         x=x,
         objective=evaluate(qp, instance, x),
         bound=jnp.asarray(-jnp.inf),
-        status=jnp.where((state.residual <= ACCEPTABLE) & ~jnp.any(lower > upper + FIXED), OPTIMAL, FAILED),
+        status=jnp.where(
+            (state.best_residual <= ACCEPTABLE) & ~jnp.any(lower > upper + FIXED), OPTIMAL, FAILED
+        ),
         iterations=state.iterations,
         row_price=price["above"] - price["below"],
         limit_price=jnp.zeros(all_predictions),
@@ -424,7 +445,7 @@ def solve(
         upper_price=price["box_high"],
         row_low_price=price["row_low"],
         row_high_price=price["row_high"],
-        residual=state.residual,
+        residual=state.best_residual,
     )
     return dual_bound(qp, w_matrix, instance, solution, lower, upper, price["high"], price["low"])
 

@@ -17,8 +17,8 @@ from jaxmpc.newton import WarmStart, certified, refine, warm_start_of
 from jaxmpc.qp import QpSolution, solve
 from jaxmpc.status import FAILED, OPTIMAL
 
-ROUGH = 1e-8  # relative gap at which the interior point stops
-ENOUGH = 3e-8  # relative gap up to which its result needs no Newton finish
+ROUGH = 1e-9  # relative gap at which the interior point stops
+ENOUGH = 5e-9  # relative gap up to which its result needs no Newton finish
 ACCEPTED = 1e-6  # relative gap up to which the better of all results counts as solved
 
 
