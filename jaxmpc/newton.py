@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxmpc.condense import CondensedQp, QpInstance
-from jaxmpc.qp import FIXED, TINY, QpSolution, dual_bound, evaluate, solver_unit
+from jaxmpc.qp import FIXED, TINY, QpSolution, dual_bound, evaluate, solver_unit, weighted_gram
 from jaxmpc.status import FAILED, OPTIMAL
 
 STEPS = 14  # Newton steps after which a start is given up
@@ -79,7 +79,6 @@ def refine(
 
     The status is `OPTIMAL` only if the duality gap is closed and the hard rows hold; otherwise solve anew.
     """
-    n = lower.shape[0]
     w_matrix = jnp.asarray(rows)
     offset = instance.offset
     unit = solver_unit(qp, instance)
@@ -93,14 +92,7 @@ def refine(
     row_high = jnp.where(takes_part, instance.row_high, jnp.inf)
     row_sigma = PENALTY / jnp.maximum(jnp.sum(qp.theta**2, axis=1), TINY)
     hard_sigma = PENALTY / jnp.maximum(jnp.sum(w_matrix**2, axis=1), TINY)
-    first, second = np.triu_indices(n)
-    back = np.zeros((n, n), dtype=np.int32)
-    back[first, second] = back[second, first] = np.arange(len(first))
-
-    def gram(weights):
-        if qp.packed is not None:
-            return jnp.take(weights @ qp.packed, back.reshape(-1)).reshape(n, n)
-        return qp.theta.T @ (weights[:, None] * qp.theta)
+    gram = weighted_gram(qp)
 
     def row_prox(t, price):
         """New price of a deadzone row and its slope in t."""

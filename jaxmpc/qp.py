@@ -92,6 +92,21 @@ def solver_unit(qp: CondensedQp, instance: QpInstance) -> Float[Array, ""]:
     return jnp.where(unit > 0.0, unit, 1.0)
 
 
+def weighted_gram(qp: CondensedQp):
+    """The function w -> theta' diag(w) theta, by the packed products where they are kept."""
+    n = qp.theta.shape[1]
+    first, second = np.triu_indices(n)
+    place = np.zeros((n, n), dtype=np.int32)
+    place[first, second] = place[second, first] = np.arange(len(first))
+
+    def gram(weights: Float[Array, " row"]) -> Float[Array, "n n"]:
+        if qp.packed is not None:
+            return jnp.take(weights @ qp.packed, place.reshape(-1)).reshape(n, n)
+        return qp.theta.T @ (weights[:, None] * qp.theta)
+
+    return gram
+
+
 def _limit_cost(qp: CondensedQp, instance: QpInstance, t):
     """Rho times the largest violation per CV and side, high sides first."""
     if not qp.has_limits:
@@ -225,14 +240,7 @@ def solve(
     limit_low = finite(instance.limit_low[:predictions], low_on)
     box_low, box_high = finite(lower, on["box_low"]), finite(upper, on["box_high"])
     row_low, row_high = finite(instance.row_low, on["row_low"]), finite(instance.row_high, on["row_high"])
-    first, second = np.triu_indices(n)
-    back = np.zeros((n, n), dtype=np.int32)
-    back[first, second] = back[second, first] = np.arange(len(first))
-
-    def gram(weights):
-        if qp.packed is not None:
-            return jnp.take(weights @ qp.packed, back.reshape(-1)).reshape(n, n)
-        return qp.theta.T @ (weights[:, None] * qp.theta)
+    gram = weighted_gram(qp)
 
     def per_prediction(values):  # one value per CV and side, spread over the horizon: high sides, low sides
         wide = jnp.repeat(values, horizon) if groups else values

@@ -59,7 +59,9 @@ def test_a_loop_starts_in_steady_state_and_follows_the_setpoint(model):
     before = np.abs(run.cv[20] - run.setpoint[20])
     after = np.abs(run.cv[-1] - run.setpoint[-1])
     assert (after < before).all()
-    np.testing.assert_allclose(np.cumsum(run.move, axis=0) + np.array([50.0, 7500.0]), run.mv_demand, atol=1e-9)
+    np.testing.assert_allclose(
+        np.cumsum(run.move, axis=0) + np.array([50.0, 7500.0]), run.mv_demand, atol=1e-9
+    )
 
 
 def test_a_pressure_drop_reaches_the_well_and_lift_answers(model):
