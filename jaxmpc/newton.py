@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxmpc.condense import CondensedQp, QpInstance
-from jaxmpc.qp import FIXED, TINY, QpSolution, dual_bound, evaluate, solver_unit, weighted_gram
+from jaxmpc.relaxed_problem import FIXED, TINY, QpSolution, dual_bound, evaluate, solver_unit, weighted_gram
 from jaxmpc.status import FAILED, OPTIMAL
 
 STEPS = 14  # Newton steps after which a start is given up

@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 
 from jaxmpc.condense import CondensedQp, QpInstance
 from jaxmpc.newton import WarmStart, certified, refine, warm_start_of
-from jaxmpc.qp import QpSolution, solve
+from jaxmpc.qp import solve
+from jaxmpc.relaxed_problem import QpSolution
 from jaxmpc.status import FAILED, OPTIMAL
 
 ROUGH = 1e-9  # relative gap at which the interior point stops

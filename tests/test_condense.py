@@ -15,7 +15,7 @@ from jaxmpc.blocking import (
 )
 from jaxmpc.condense import condense, dynamic_matrix, make_instance
 from jaxmpc.errors import InputError
-from jaxmpc.qp import evaluate
+from jaxmpc.relaxed_problem import evaluate
 from jaxmpc.structure import Structure
 from jaxmpc.tuning import make_tuning
 

@@ -10,8 +10,9 @@ from jaxmpc import status
 from jaxmpc.blocking import hard_rows
 from jaxmpc.condense import condense, make_instance
 from jaxmpc.newton import WarmStart, refine, warm_start_of
-from jaxmpc.qp import evaluate, solve
+from jaxmpc.qp import solve
 from jaxmpc.relaxation import solve_relaxed
+from jaxmpc.relaxed_problem import evaluate
 from jaxmpc.tuning import make_tuning
 
 LANES = 16
