@@ -110,7 +110,7 @@ def _tools() -> dict[str, str]:
         raise MissingToolError(
             f"Cannot build the FMU: {' and '.join(missing)} not found. On Debian or Ubuntu: "
             "apt install gcc libc6-dev make (and cmake, or: pip install cmake); on macOS: "
-            "xcode-select --install. The JAX well needs none of this."
+            "xcode-select --install. The JAX well needs none of this: --plant jax."
         )
     return environment
 
