@@ -104,3 +104,10 @@ def hard_rows(structure: Structure) -> Float[np.ndarray, "row n"]:
         wide[:, mv * structure.block_count : (mv + 1) * structure.block_count] = rows
         parts.append(wide)
     return np.concatenate(parts)
+
+
+@functools.lru_cache(maxsize=64)
+def first_position_rows(structure: Structure) -> Int[np.ndarray, " mv"]:
+    """Where the position rows of each MV begin in `hard_rows`; there is one per block."""
+    rows, blocks = hard_rows(structure), structure.block_count
+    return np.array([np.flatnonzero(rows[:, mv * blocks])[0] for mv in range(structure.mv_count)])

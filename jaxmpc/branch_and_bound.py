@@ -15,16 +15,15 @@ from jaxmpc.propagation import propagate, satisfied
 from jaxmpc.search import MANY, SINGLE, Relaxations, Search
 
 
-def branch_and_bound(search: Search, root: Relaxations, lower, upper, root_bound: float) -> float:
-    """Best-first branch and bound, a batch of nodes at a time; returns the least bound still open."""
+def branch_and_bound(
+    search: Search, root: Relaxations, model: LowerModel, lower, upper, root_bound: float
+) -> float:
+    """Best-first branch and bound, a batch of nodes at a time; returns the least bound still open.
+
+    `model` is the root's, over the limits the root was solved with; `lower` and `upper` may be tighter.
+    """
     c = search.constants
     counter = itertools.count()
-    model = search.lower_model(
-        root,
-        0,
-        np.round(search.limits[0][c.integer]).astype(int),
-        np.round(search.limits[1][c.integer]).astype(int),
-    )
     heap = [(root_bound, next(counter), lower, upper, model, root.x[0, c.integer], root.start(0))]
     while heap:
         if heap[0][0] >= search.cutoff:
@@ -58,8 +57,7 @@ def branch_and_bound(search: Search, root: Relaxations, lower, upper, root_bound
             if leaf[i]:
                 if satisfied(search.chains, low[i : i + 1], low[i], high[i])[0]:
                     search.seen.add(low[i].tobytes())
-                    if result.objective[i] < search.value:
-                        search.value, search.x = float(result.objective[i]), result.x[i]
+                    search.offer(result, i)
                     search.discard(float(min(bounds[i], result.objective[i])))
             elif bounds[i] < search.cutoff:
                 candidates.append(search.rounded(result.x[i, c.integer], low[i], high[i]))

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmpc import status as codes
-from jaxmpc.blocking import block_members, hard_rows, moves_per_block, sample_moves
+from jaxmpc.blocking import block_members, first_position_rows, hard_rows, moves_per_block, sample_moves
 from jaxmpc.condense import CondensedQp, condense, make_instance
 from jaxmpc.disturbance import filter_bias
 from jaxmpc.errors import InputError
@@ -238,9 +238,7 @@ class ContinuousController(eqx.Module):
         blocks = structure.block_count
         unit = self.qp.scale[::blocks]
         low, high = instance.lower[::blocks], instance.upper[::blocks]
-        first = np.array(
-            [np.flatnonzero(hard_rows(structure)[:, mv * blocks])[0] for mv in range(structure.mv_count)]
-        )
+        first = first_position_rows(structure)
         end_low, end_high = instance.row_low[first], instance.row_high[first]
         held = moves_per_block(structure)[0]
         move = (

@@ -12,7 +12,7 @@ import time
 
 import numpy as np
 
-from jaxmpc.blocking import hard_rows, moves_per_block
+from jaxmpc.blocking import first_position_rows, moves_per_block
 from jaxmpc.branch_and_bound import branch_and_bound
 from jaxmpc.condense import QpInstance
 from jaxmpc.levelset import LowerModel, enumerate_below, exclude
@@ -98,11 +98,11 @@ def solve_integer(
         seconds = search.seconds_left()
         if finish == "auto":
             seconds = HIGHS_SECONDS if seconds is None else min(seconds, HIGHS_SECONDS)
-        done, bound = outer_approximation(search, root, lower, upper, seconds)
+        done, bound = outer_approximation(search, lower, upper, seconds)
         root_bound = max(root_bound, min(bound, search.value))
         if done or finish == "highs":
             return search.finish("highs" if done else None, root_bound)
-    bound = branch_and_bound(search, root, lower, upper, root_bound)
+    bound = branch_and_bound(search, root, model, lower, upper, root_bound)
     return search.finish("branch-and-bound", bound)
 
 
@@ -110,13 +110,13 @@ def continuous_feasible(structure: Structure, instance: QpInstance) -> bool:
     """Whether the limits of the continuous MVs leave any moves at all (exact, by reachable positions)."""
     lower, upper = np.asarray(instance.lower), np.asarray(instance.upper)
     counts = moves_per_block(structure)
-    rows, blocks = hard_rows(structure), structure.block_count
+    blocks, firsts = structure.block_count, first_position_rows(structure)
     row_low, row_high = np.asarray(instance.row_low), np.asarray(instance.row_high)
     for mv in range(structure.mv_count):
         if mv in structure.integer_mvs:
             continue
         columns = slice(mv * blocks, (mv + 1) * blocks)
-        first = int(np.flatnonzero(np.abs(rows[:, columns]).sum(axis=1))[0])
+        first = firsts[mv]
         least = most = 0.0
         slack = 1e-7
         for b in range(blocks):

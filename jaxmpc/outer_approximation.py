@@ -30,9 +30,7 @@ def _cut_of(search: Search, result: Relaxations, lane: int, lower, upper):
     return float(value), at, gradient
 
 
-def outer_approximation(
-    search: Search, root: Relaxations, lower, upper, seconds: float | None
-) -> tuple[bool, float]:
+def outer_approximation(search: Search, lower, upper, seconds: float | None) -> tuple[bool, float]:
     """Close the reduced problem with MILPs over cuts; returns whether it is closed, and the bound reached."""
     from jaxmpc.highs import ReducedMilp  # HiGHS is loaded when it is first needed
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmpc import status as codes
-from jaxmpc.blocking import moves_per_block, sample_moves
+from jaxmpc.blocking import first_position_rows, moves_per_block, sample_moves
 from jaxmpc.condense import DRIFT, QpInstance, condense, dynamic_matrix, integer_columns, make_instance
 from jaxmpc.errors import InputError
 from jaxmpc.integer import FINISHES, continuous_feasible, solve_integer
@@ -320,10 +320,7 @@ def _repair(structure: Structure, instance: QpInstance, x: np.ndarray) -> np.nda
     lower, upper = np.asarray(instance.lower), np.asarray(instance.upper)
     row_low, row_high = np.asarray(instance.row_low), np.asarray(instance.row_high)
     counts, blocks = moves_per_block(structure), structure.block_count
-    row = 0
-    from jaxmpc.blocking import oscillation_rows, window_rows
-
-    for mv in range(structure.mv_count):
+    for mv, row in enumerate(first_position_rows(structure)):
         columns = slice(mv * blocks, (mv + 1) * blocks)
         if mv not in structure.integer_mvs:
             position, own = 0.0, x[columns]
@@ -332,8 +329,6 @@ def _repair(structure: Structure, instance: QpInstance, x: np.ndarray) -> np.nda
                 high = min(upper[columns][b], (row_high[row + b] - position) / counts[b])
                 own[b] = min(max(own[b], low), high) if low <= high else own[b]
                 position += counts[b] * own[b]
-        row += blocks + (len(oscillation_rows(structure)) if mv in structure.integer_mvs else 0)
-        row += len(window_rows(structure))
     return x
 
 

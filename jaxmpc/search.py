@@ -68,6 +68,7 @@ class Constants:
         # few lanes do not pay for streaming the packed products through the cache
         self.lean = eqx.tree_at(lambda q: q.packed, qp, None, is_leaf=lambda leaf: leaf is None)
         self.rows = hard_rows(structure)
+        self.cold = jax.tree.map(np.asarray, cold_start(qp, len(self.rows)))
         self.integer = integer_columns(structure)
         hessian = np.asarray(qp.hessian)
         self.schur, self.radius = schur_complement(hessian, self.integer)
@@ -120,7 +121,7 @@ class Search:
         self.nodes = 0
         self.seen: set[bytes] = set()
         self.compiling = 0.0  # seconds of first calls
-        self.start = jax.tree.map(np.asarray, cold_start(constants.qp, len(constants.rows)))
+        self.start = constants.cold
         self.lanes = BATCH if len(self.limits[0]) <= WIDE else 1
 
     # ---- bookkeeping
@@ -184,13 +185,17 @@ class Search:
                 self.deadline += time.perf_counter() - begin
         return _relax(*arguments)
 
+    def offer(self, result: Relaxations, lane: int) -> None:
+        """Take a solved problem with whole moves as incumbent if it is better."""
+        if result.objective[lane] < self.value and np.isfinite(result.x[lane]).all():
+            self.value, self.x = float(result.objective[lane]), result.x[lane]
+
     def evaluate(self, points: np.ndarray, bounds: np.ndarray | None = None) -> Relaxations:
         """Solve the problems with the whole moves fixed, take the best as incumbent, discard the rest."""
         result = self.relax(points, points)
         for i in range(len(points)):
             self.seen.add(points[i].tobytes())
-            if result.objective[i] < self.value and np.isfinite(result.x[i]).all():
-                self.value, self.x = float(result.objective[i]), result.x[i]
+            self.offer(result, i)
         known = result.bound if bounds is None else np.maximum(result.bound, bounds)
         for i in range(len(points)):
             self.discard(float(min(known[i], result.objective[i])))
