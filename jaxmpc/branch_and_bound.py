@@ -12,12 +12,15 @@ import numpy as np
 
 from jaxmpc.levelset import LowerModel, exclude
 from jaxmpc.propagation import propagate, satisfied
-from jaxmpc.search import MANY, SINGLE, Relaxations, Search
+from jaxmpc.relaxer import Relaxations
+from jaxmpc.search import GROUP, Search, Steps
+
+MANY, BATCH = 64, 64  # nodes from which whole batches are solved, and their size
 
 
 def branch_and_bound(
     search: Search, root: Relaxations, model: LowerModel, lower, upper, root_bound: float
-) -> float:
+) -> Steps:
     """Best-first branch and bound, a batch of nodes at a time; returns the least bound still open.
 
     `model` is the root's, over the limits the root was solved with; `lower` and `upper` may be tighter.
@@ -32,8 +35,8 @@ def branch_and_bound(
         if search.out_of_time():
             return heap[0][0]
         children = []
-        width = SINGLE - 2 if search.nodes < MANY else max(search.lanes - 1, 1)
-        while heap and len(children) < min(width, max(search.lanes - 1, 1)):
+        width = GROUP if search.nodes < MANY or len(lower) > MANY else BATCH
+        while heap and len(children) < width - 1:
             bound, _, low, high, model, center, start = heapq.heappop(heap)
             if bound >= search.cutoff:
                 search.discard(bound)
@@ -48,7 +51,7 @@ def branch_and_bound(
         starts = [child[3] for child, keep in zip(children, possible, strict=True) if keep]
         if not len(low):
             continue
-        result = search.relax(low, high, starts)
+        result = yield from search.relax(low, high, starts)
         search.nodes += len(low)
         leaf = (low == high).all(axis=1)
         candidates = []
@@ -58,10 +61,13 @@ def branch_and_bound(
                 if satisfied(search.chains, low[i : i + 1], low[i], high[i])[0]:
                     search.seen.add(low[i].tobytes())
                     search.offer(result, i)
-                    search.discard(float(min(bounds[i], result.objective[i])))
+                    search.discard(float(min(bounds[i], result.snapped[i])))
             elif bounds[i] < search.cutoff:
+                search.offer(result, i)
                 candidates.append(search.rounded(result.x[i, c.integer], low[i], high[i]))
-        search.try_points(candidates[: SINGLE - 1])
+        points = search.new(candidates)[:GROUP]
+        if len(points):
+            yield from search.evaluate(points)
         for i in map(int, np.flatnonzero(~leaf)):
             if bounds[i] >= search.cutoff:
                 search.discard(float(bounds[i]))

@@ -55,6 +55,10 @@ class ReducedMilp:
             if width > 1:
                 self._row(-np.inf, 1.0, np.arange(column - width, column), np.ones(width))
         self._hard_rows(chains)
+        self.cutoff_row = highs.getNumRow()
+        costs = np.asarray(highs.getLp().col_cost_)
+        index = np.flatnonzero(costs)
+        self._row(-np.inf, np.inf, index, costs[index])
 
     def _row(self, low: float, high: float, index: np.ndarray, value: np.ndarray) -> None:
         self.highs.addRow(
@@ -102,6 +106,11 @@ class ReducedMilp:
         right = value / self.unit - gradient @ at / self.unit + constant
         self._row(float(right), np.inf, np.concatenate([[0], index]), np.concatenate([[1.0], -slope]))
 
+    def set_cutoff(self, value: float) -> None:
+        """Only moves whose own cost and theta stay below `value` are of interest from now on (infinite for all)."""
+        high = value / self.unit - self.base if np.isfinite(value) else np.inf
+        self.highs.changeRowBounds(self.cutoff_row, -np.inf, high)
+
     def forbid(self, point: np.ndarray) -> None:
         """No-good cut: at least one free move differs from `point`."""
         index, value, right = [], [], 1.0
@@ -126,7 +135,6 @@ class ReducedMilp:
 
         Args:
             seconds: time limit, None for none.
-            cutoff: nothing at or above this value is of interest.
 
         Returns:
             ``(bound, point, finished)``: a lower bound of everything not forbidden, the best whole moves (None
@@ -155,3 +163,53 @@ class ReducedMilp:
                 columns = np.asarray(solution[self.first_column[i] : self.first_column[i] + width])
                 point[i] = self.lower[i] + int(np.round(columns @ np.arange(1, width + 1)))
         return value, point, finished
+
+
+def solve_qp(
+    P, c, A, row_low, row_high, low, high, *, seconds: float | None = None
+) -> tuple[str, np.ndarray | None]:
+    """Min x'Px/2 + c'x subject to row_low <= A x <= row_high, low <= x <= high, by the QP solver of HiGHS.
+
+    The controllers do not use it: it fails on most of their problems. The benchmark compares with it.
+
+    Args:
+        P: Hessian, a SciPy CSC matrix ``"n n"``.
+        c: linear cost.
+        A: rows, a SciPy sparse matrix ``"row n"``.
+        row_low, row_high, low, high: limits, infinite for none.
+        seconds: time limit, None for none.
+
+    Returns:
+        ``(status, x)``: ``optimal``, ``limit``, ``infeasible`` or ``failed``, and the point where it is optimal.
+    """
+    highs = highspy.Highs()
+    highs.setOptionValue("output_flag", False)
+    if seconds is not None:
+        highs.setOptionValue("time_limit", float(seconds))
+    columns = A.tocsc()
+    lp = highspy.HighsLp()
+    lp.num_col_, lp.num_row_ = len(c), A.shape[0]
+    lp.col_cost_, lp.col_lower_, lp.col_upper_ = c, low, high
+    lp.row_lower_, lp.row_upper_ = row_low, row_high
+    lp.a_matrix_.format_ = highspy.MatrixFormat.kColwise
+    lp.a_matrix_.start_, lp.a_matrix_.index_, lp.a_matrix_.value_ = (
+        columns.indptr,
+        columns.indices,
+        columns.data,
+    )
+    highs.passModel(lp)
+    lower = P.copy()  # HiGHS wants the lower triangle, by columns
+    rows, place = P.indices, np.repeat(np.arange(len(c)), np.diff(P.indptr))
+    lower.data = np.where(rows >= place, P.data, 0.0)
+    lower.eliminate_zeros()
+    hessian = highspy.HighsHessian()
+    hessian.dim_, hessian.format_ = len(c), highspy.HessianFormat.kTriangular
+    hessian.start_, hessian.index_, hessian.value_ = lower.indptr, lower.indices, lower.data
+    highs.passHessian(hessian)
+    highs.run()
+    status = highs.getModelStatus()
+    if status == highspy.HighsModelStatus.kOptimal:
+        return "optimal", np.array(highs.getSolution().col_value)
+    if status == highspy.HighsModelStatus.kInfeasible:
+        return "infeasible", None
+    return ("limit" if status == highspy.HighsModelStatus.kTimeLimit else "failed"), None

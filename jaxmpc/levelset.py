@@ -30,6 +30,8 @@ class LowerModel:
         excess: ``"integer value"``; column v stands for the move `lower + v`, infinite beyond `upper`.
         schur: S.
         radius: diagonal of the inverse of S; bounds one move with the others free.
+        order: in which the moves are assigned one after the other, block by block.
+        leading: R with R'R = S in that order, lower triangular, so that term i of |R d|^2 involves d_0..d_i only.
     """
 
     value: float
@@ -39,6 +41,8 @@ class LowerModel:
     excess: Float[np.ndarray, "integer value"]
     schur: Float[np.ndarray, "integer integer"]
     radius: Float[np.ndarray, " integer"]
+    order: Int[np.ndarray, " integer"]
+    leading: Float[np.ndarray, "integer integer"]
 
 
 def schur_complement(hessian: np.ndarray, integer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -72,6 +76,12 @@ def schur_complement(hessian: np.ndarray, integer: np.ndarray) -> tuple[np.ndarr
     return block, radius
 
 
+def root_factor(schur: np.ndarray) -> np.ndarray:
+    """L with L L' = S, for values d'S d = |d L|^2 of many points at once."""
+    values, vectors = np.linalg.eigh(schur)
+    return vectors * np.sqrt(np.maximum(values, 0.0))
+
+
 def exclude(model: LowerModel, cutoff: float) -> tuple[np.ndarray, np.ndarray]:
     """Integer limits that keep every move whose own bound is below `cutoff` (the value of the incumbent)."""
     values = model.lower[:, None] + np.arange(model.excess.shape[1])[None, :]
@@ -98,6 +108,7 @@ def enumerate_below(
     upper: np.ndarray,
     cutoff: float,
     most: int | None,
+    beam: int | None = None,
 ) -> tuple[np.ndarray, np.ndarray, float] | None:
     """All whole moves within limits whose bound is below `cutoff`, by breadth-first search over the blocks.
 
@@ -107,55 +118,56 @@ def enumerate_below(
         lower, upper: limits of the moves, within the model's.
         cutoff: moves with a bound at or above it are left out.
         most: give up (return None) when more partial assignments than this are alive at once; None for no limit.
+        beam: keep only so many partial assignments of least bound, to find good moves rather than all.
 
     Returns:
         ``(moves "point integer", bounds "point", least)`` sorted by bound, `least` being the smallest bound of
         what was left out (infinite if nothing was), or None.
     """
-    blocks = len(chains[0].columns)
-    order = np.array([chain.columns[b] for b in range(blocks) for chain in chains])
-    owner = [(chain, b) for b in range(blocks) for chain in chains]
-    # S = R'R with R lower triangular in this order, so that a partial assignment fixes the leading terms
-    permuted = model.schur[np.ix_(order, order)]
-    factor = _leading_factor(permuted)
-    count = len(order)
-    moves = np.zeros((1, count), dtype=int)
+    owners = [(k, b) for b in range(len(chains[0].columns)) for k in range(len(chains))]
+    moves = np.zeros((1, 0), dtype=int)
     bounds = np.array([model.value])
-    position = {id(chain): np.zeros(1, dtype=int) for chain in chains}
+    position = np.zeros((1, len(chains)), dtype=int)
     least = np.inf
-    for i in range(count):
-        chain, b = owner[i]
-        column = order[i]
+    for i, (k, b) in enumerate(owners):
+        chain, column = chains[k], model.order[i]
         domain = np.arange(int(lower[column]), int(upper[column]) + 1)
-        parents = np.repeat(np.arange(len(moves)), len(domain))
-        value = np.tile(domain, len(moves))
-        moves, bounds = moves[parents], bounds[parents]
-        moves[:, i] = value
-        position = {key: state[parents] for key, state in position.items()}
-        position[id(chain)] = position[id(chain)] + chain.counts[b] * value
-        good = (position[id(chain)] >= chain.low[b]) & (position[id(chain)] <= chain.high[b])
+        row, center = model.leading[i], model.center[model.order]
+        own = model.excess[column, domain - model.lower[column]]
+        term = (moves @ row[:i] - row[: i + 1] @ center[: i + 1])[:, None] + row[i] * domain
+        reached = position[:, k, None] + chain.counts[b] * domain
+        total = bounds[:, None] + 0.5 * term**2 + own
+        good = (reached >= chain.low[b]) & (reached <= chain.high[b])
         if chain.coupled[b]:
-            good &= np.abs(value - moves[:, i - len(chains)]) <= 1
-        away = moves[:, : i + 1] - model.center[order[: i + 1]]
-        term = away @ factor[i, : i + 1]
-        bounds = bounds + 0.5 * term**2 + model.excess[column, value - model.lower[column]]
-        out = good & ~(bounds < cutoff)
-        if out.any():
-            least = min(least, bounds[out].min())
-        good &= bounds < cutoff
-        moves, bounds = moves[good], bounds[good]
-        position = {key: state[good] for key, state in position.items()}
-        if most is not None and len(moves) > most:
+            good &= np.abs(domain - moves[:, i - len(chains), None]) <= 1
+        below = total < cutoff
+        if np.isfinite(cutoff):
+            out = good & ~below
+            least = min(least, total[out].min(initial=np.inf))
+        parents, chosen = np.nonzero(good & below)
+        bounds = total[parents, chosen]
+        if most is not None and len(bounds) > most:
             return None
+        if beam is not None and len(bounds) > beam:
+            best = np.argpartition(bounds, beam)[:beam]
+            parents, chosen, bounds = parents[best], chosen[best], bounds[best]
+        moves = np.concatenate([moves[parents], domain[chosen, None]], axis=1)
+        position = position[parents]
+        position[:, k] = reached[parents, chosen]
         if not len(moves):
             break
-    result = np.zeros_like(moves)
-    result[:, order] = moves
+    result = np.zeros((len(moves), len(owners)), dtype=int)
+    result[:, model.order[: moves.shape[1]]] = moves
     rank = np.argsort(bounds, kind="stable")
     return result[rank], bounds[rank], least
 
 
-def _leading_factor(matrix: np.ndarray) -> np.ndarray:
+def assignment_order(blocks: int, chains: int) -> Int[np.ndarray, " integer"]:
+    """Integer moves block by block, the MVs of a block one after the other."""
+    return np.arange(blocks * chains).reshape(chains, blocks).T.reshape(-1)
+
+
+def leading_factor(matrix: np.ndarray) -> np.ndarray:
     """Lower-triangular R with R'R = matrix, so that term i of |R d|^2 involves d_0..d_i only."""
     values, vectors = np.linalg.eigh(matrix)
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T

@@ -10,7 +10,7 @@ import functools
 import time
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -18,9 +18,10 @@ from jaxmpc import status as codes
 from jaxmpc.blocking import first_position_rows, moves_per_block, sample_moves
 from jaxmpc.condense import DRIFT, QpInstance, condense, dynamic_matrix, integer_columns, make_instance
 from jaxmpc.errors import InputError
-from jaxmpc.integer import FINISHES, continuous_feasible, solve_integer
+from jaxmpc.integer import FINISHES, continuous_feasible, solve_integers
 from jaxmpc.newton import WarmStart
-from jaxmpc.search import Constants, Search, SearchResult
+from jaxmpc.relaxer import Constants, Relaxer
+from jaxmpc.search import SearchResult
 from jaxmpc.step_response import StepResponseModel
 from jaxmpc.structure import Structure
 from jaxmpc.tuning import Tuning
@@ -62,9 +63,10 @@ class Plan:
     warm: WarmStart | None = None
 
 
-@functools.partial(eqx.filter_jit)
+@functools.partial(jax.jit, static_argnames=("structure", "recover"))
 def _make_instance(structure, tuning, qp, free_response, setpoint, mv_now, last_move, past_moves, recover):
-    return make_instance(
+    """The problem of one sample, with a scenario axis of one."""
+    instance = make_instance(
         structure,
         tuning,
         qp,
@@ -75,6 +77,7 @@ def _make_instance(structure, tuning, qp, free_response, setpoint, mv_now, last_
         past_moves=past_moves,
         recover=recover,
     )
+    return jax.tree.map(lambda leaf: leaf[None], instance)
 
 
 _condense = eqx.filter_jit(condense)
@@ -93,14 +96,14 @@ class Planner:
         check_match(structure, model)
         self.structure, self.tuning, self.model = structure, tuning, model
         self.matrix = np.asarray(dynamic_matrix(structure, model.coefficients))
-        self._constants: dict[int, Constants] = {}
+        self._relaxers: dict[int, Relaxer] = {}
         self._started = False
         limits = np.concatenate([np.asarray(tuning.cv_low), np.asarray(tuning.cv_high)])
         self.has_limits = bool(np.isfinite(limits).any() and (np.asarray(tuning.slack_weight) > 0).any())
 
-    def constants(self, envelope: int) -> Constants:
-        """Constants for integer ranges of so many steps, made when first needed."""
-        if envelope not in self._constants:
+    def relaxer(self, envelope: int) -> Relaxer:
+        """Compiled relaxations for integer ranges of so many steps, made when first needed."""
+        if envelope not in self._relaxers:
             qp = _condense(
                 self.structure,
                 self.tuning,
@@ -108,8 +111,12 @@ class Planner:
                 envelope=envelope,
                 has_limits=self.has_limits,
             )
-            self._constants[envelope] = Constants(self.structure, qp)
-        return self._constants[envelope]
+            self._relaxers[envelope] = Relaxer([Constants(self.structure, qp)])
+        return self._relaxers[envelope]
+
+    def constants(self, envelope: int) -> Constants:
+        """Constants for integer ranges of so many steps."""
+        return self.relaxer(envelope).scenario(0)
 
     def solve(
         self,
@@ -160,86 +167,89 @@ class Planner:
                 recover,
             )
 
-        constants = self.constants(1)
+        relaxer = self.relaxer(1)
+        integer = relaxer.integer
         if not self._started:  # compiles; the clock measures solves
-            instance_of(constants).offset.block_until_ready()
+            jax.block_until_ready(instance_of(relaxer.scenario(0)))
             self._started = True
-        begin = time.perf_counter()
-        instance = instance_of(constants)
-        integer = constants.integer
+        begin = time.perf_counter() - self._compiling()
+        instance = instance_of(relaxer.scenario(0))
         if len(integer):
-            instance = self._bounded(instance)
-            widest = np.abs(
-                np.concatenate([np.asarray(instance.lower)[integer], np.asarray(instance.upper)[integer]])
-            )
-            envelope = int(widest.max())
+            lower, upper = self._bounded(instance)
+            envelope = int(max(np.abs(lower[:, integer]).max(), np.abs(upper[:, integer]).max()))
             if envelope > 1:
-                constants = self.constants(envelope if envelope <= WIDEST_ENVELOPE else 0)
-                bounded = instance
-                instance = instance_of(constants)
-                instance = eqx.tree_at(lambda i: (i.lower, i.upper), instance, (bounded.lower, bounded.upper))
+                relaxer = self.relaxer(envelope if envelope <= WIDEST_ENVELOPE else 0)
+                instance = instance_of(relaxer.scenario(0))
+            instance = eqx.tree_at(lambda i: (i.lower, i.upper), instance, (lower, upper))
+        constants = relaxer.scenario(0)
         starts = []
         if previous_moves is not None and len(integer):
             scale = np.asarray(constants.qp.scale).reshape(self.structure.mv_count, -1).T
             wanted = (as_array(previous_moves) / scale).T.reshape(-1)[integer]
             starts.append(np.clip(np.nan_to_num(wanted), -1e6, 1e6))
+        start = jax.tree.map(lambda leaf: np.asarray(leaf)[None], _fitting(warm, constants))
         result = (
-            solve_integer(
-                constants,
-                instance,
-                starts=starts,
-                warm=_fitting(warm, constants),
-                gap=gap,
-                time_limit=time_limit,
-                finish=finish,
-            )
+            solve_integers(
+                relaxer, instance, starts=[starts], warm=start, gap=gap, time_limit=time_limit, finish=finish
+            )[0]
             if len(integer)
-            else self._solve_relaxed(constants, instance, gap)
+            else self._solve_relaxed(relaxer, instance, start, gap)
         )
+        instance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], instance)
         return self._plan(constants, instance, result, mv_now, free_response, setpoint, gap, begin)
 
-    def _solve_relaxed(self, constants: Constants, instance: QpInstance, gap: float) -> SearchResult:
+    def _compiling(self) -> float:
+        """Seconds of compilation so far."""
+        return sum(relaxer.compiling for relaxer in self._relaxers.values())
+
+    def _solve_relaxed(
+        self, relaxer: Relaxer, instance: QpInstance, start: WarmStart, gap: float
+    ) -> SearchResult:
         """The problem without integers: one relaxation."""
-        if not continuous_feasible(self.structure, instance):
+        if not continuous_feasible(self.structure, jax.tree.map(lambda leaf: np.asarray(leaf)[0], instance)):
             return SearchResult(None, np.inf, np.inf, codes.INFEASIBLE, None, 0)
-        search = Search(constants, instance, gap, None)
-        empty = np.zeros((1, 0), dtype=int)
-        root = search.relax(empty, empty)
+        root = relaxer.solve_roots(instance, start)
         if not np.isfinite(root.x[0]).all():
             return SearchResult(None, np.inf, -np.inf, codes.FAILED, None, 1)
-        search.value, search.x = float(root.objective[0]), root.x[0]
-        search.nodes = 1
-        return search.finish("relaxation", float(root.bound[0]))
+        value = float(root.objective[0])
+        bound = min(max(float(root.bound[0]), 0.0), value)
+        closed = value - bound <= max(gap, 1e-9) * max(abs(value), 1e-6 * relaxer.scenario(0).scale)
+        status, by = (codes.OPTIMAL, "relaxation") if closed else (codes.LIMIT, None)
+        return SearchResult(root.x[0], value, bound, status, by, 1, root.start(0))
 
-    def _bounded(self, instance: QpInstance) -> QpInstance:
-        """Finite limits for integer moves that have none: the level set of a rounded plan (see `levelset`)."""
+    def _bounded(self, instance: QpInstance) -> tuple[np.ndarray, np.ndarray]:
+        """Finite limits ``"1 n"`` for integer moves that have none: the level set of a rounded plan (see `levelset`)."""
         lower, upper = np.array(instance.lower), np.array(instance.upper)
         integer = integer_columns(self.structure)
-        if np.isfinite(lower[integer]).all() and np.isfinite(upper[integer]).all():
-            return instance
-        constants = self.constants(0)
-        search = Search(constants, _padded(instance, constants), 1e-6, None)
-        root = search.relax(lower[integer][None], upper[integer][None])
-        whole_low = np.where(np.isfinite(lower[integer]), lower[integer], -1e6).astype(int)
-        whole_high = np.where(np.isfinite(upper[integer]), upper[integer], 1e6).astype(int)
-        start = np.clip(np.round(root.x[0, integer]).astype(int), whole_low, whole_high)
-        search.evaluate(start[None])
-        reach = np.sqrt(2.0 * max(search.value - float(root.bound[0]), 0.0) * constants.radius) + 1.0
+        if np.isfinite(lower[:, integer]).all() and np.isfinite(upper[:, integer]).all():
+            return lower, upper
+        relaxer = self.relaxer(0)
+        constants = relaxer.scenario(0)
+        padded = _padded(instance, constants)
+        start = jax.tree.map(lambda leaf: leaf[None], constants.cold)
+        root = relaxer.solve_roots(padded, start)
+        center = root.x[:, integer]
+        whole_low = np.where(np.isfinite(lower[:, integer]), lower[:, integer], -1e6)
+        whole_high = np.where(np.isfinite(upper[:, integer]), upper[:, integer], 1e6)
+        fixed_low, fixed_high = lower.copy(), upper.copy()
+        fixed_low[:, integer] = fixed_high[:, integer] = np.clip(np.round(center), whole_low, whole_high)
+        fixed = eqx.tree_at(lambda i: (i.lower, i.upper), padded, (fixed_low, fixed_high))
+        rounded = relaxer.solve_roots(fixed, start)
+        reach = np.sqrt(2.0 * max(rounded.snapped[0] - root.bound[0], 0.0) * constants.radius) + 1.0
         if not np.isfinite(reach).all():
             raise InputError(
                 "tuning.move_low",
                 "infinite",
                 "a finite move or MV limit for every integer MV that has neither weight nor effect",
             )
-        center = root.x[0, integer]
-        lower[integer] = np.maximum(lower[integer], np.ceil(center - reach))
-        upper[integer] = np.minimum(upper[integer], np.floor(center + reach))
-        return eqx.tree_at(lambda i: (i.lower, i.upper), instance, (jnp.asarray(lower), jnp.asarray(upper)))
+        lower[:, integer] = np.maximum(lower[:, integer], np.ceil(center - reach))
+        upper[:, integer] = np.minimum(upper[:, integer], np.floor(center + reach))
+        return lower, upper
 
     def _plan(
         self, constants, instance, result: SearchResult, mv_now, free_response, setpoint, gap, begin
     ) -> Plan:
-        elapsed = lambda: time.perf_counter() - begin - result.compiling  # noqa: E731
+        elapsed = lambda: time.perf_counter() - begin - self._compiling()  # noqa: E731
         if result.x is None:
             name = codes.STATUS[result.status]
             return Plan(name, None, None, None, None, None, None, None, None, result.nodes, elapsed(), None)
@@ -301,16 +311,17 @@ class Planner:
         return float(value), cv, (eps_high, eps_low)
 
 
-def _fitting(warm: WarmStart | None, constants: Constants) -> WarmStart | None:
-    """The start if it has as many rows as the problem (wider integer ranges have more), else None."""
-    return warm if warm is not None and len(warm.row_price) == constants.qp.theta.shape[0] else None
+def _fitting(warm: WarmStart | None, constants: Constants) -> WarmStart:
+    """The start if it has as many rows as the problem (wider integer ranges have more), else a cold one."""
+    fits = warm is not None and len(warm.row_price) == constants.qp.theta.shape[0]
+    return warm if warm is not None and fits else constants.cold
 
 
 def _padded(instance: QpInstance, constants: Constants) -> QpInstance:
     """The instance with as many envelope rows as the constants have."""
-    rows = constants.qp.theta.shape[0]
-    predictions = instance.limit_high.shape[0]
-    offset = jnp.concatenate([instance.offset[:predictions], jnp.zeros(rows - predictions)])
+    rows, predictions = constants.qp.theta.shape[0], instance.limit_high.shape[-1]
+    offset = np.asarray(instance.offset)[:, :predictions]
+    offset = np.concatenate([offset, np.zeros((1, rows - predictions))], axis=1)
     return eqx.tree_at(lambda i: i.offset, instance, offset)
 
 

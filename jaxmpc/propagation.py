@@ -98,33 +98,46 @@ def propagate(
 
 
 def _sweep(chain: Chain, lower: np.ndarray, upper: np.ndarray) -> None:
-    """One forward and one backward pass over a chain, in place."""
+    """One pass over a chain, in place: oscillation rows, positions reachable from both ends, moves between them."""
+    counts, place = chain.counts, np.arange(len(chain.columns))
     own_low, own_high = lower[:, chain.columns], upper[:, chain.columns]
-    for b in np.flatnonzero(chain.coupled):
-        own_low[:, b] = np.maximum(own_low[:, b], own_low[:, b - 1] - 1)
-        own_high[:, b] = np.minimum(own_high[:, b], own_high[:, b - 1] + 1)
-    for b in np.flatnonzero(chain.coupled)[::-1]:
-        own_low[:, b - 1] = np.maximum(own_low[:, b - 1], own_low[:, b] - 1)
-        own_high[:, b - 1] = np.minimum(own_high[:, b - 1], own_high[:, b] + 1)
-    # reachable positions: forward from zero, cut by the limits; then backward
-    at_low = np.cumsum(own_low * chain.counts, axis=1)
-    at_high = np.cumsum(own_high * chain.counts, axis=1)
-    if (at_low >= chain.low).all() and (at_high <= chain.high).all():
-        lower[:, chain.columns], upper[:, chain.columns] = own_low, own_high
-        return
-    blocks = len(chain.counts)
-    low = np.zeros((len(lower), blocks + 1), dtype=int)
-    high = np.zeros_like(low)
-    for b in range(blocks):
-        low[:, b + 1] = np.maximum(low[:, b] + chain.counts[b] * own_low[:, b], chain.low[b])
-        high[:, b + 1] = np.minimum(high[:, b] + chain.counts[b] * own_high[:, b], chain.high[b])
-    for b in reversed(range(blocks)):
-        count = chain.counts[b]
-        own_low[:, b] = np.maximum(own_low[:, b], -((high[:, b] - low[:, b + 1]) // count))
-        own_high[:, b] = np.minimum(own_high[:, b], (high[:, b + 1] - low[:, b]) // count)
-        low[:, b] = np.maximum(low[:, b], low[:, b + 1] - count * own_high[:, b])
-        high[:, b] = np.minimum(high[:, b], high[:, b + 1] - count * own_low[:, b])
-    lower[:, chain.columns], upper[:, chain.columns] = own_low, own_high
+    # |d_b - d_(b-1)| <= 1 lets a limit weaken by one per block; runs of coupled blocks are kept apart by a large offset
+    run = np.cumsum(~chain.coupled) * (8 * UNBOUNDED)
+    own_low = _running_max(own_low + place + run) - place - run
+    own_high = -_running_max(-own_high + place + run) + place + run
+    own_low = _running_max_back(own_low - place - run) + place + run
+    own_high = -_running_max_back(-own_high - place - run) - place - run
+    # positions: forward from zero within the limits, then backward
+    low = _reach(chain.low, np.cumsum(own_low * counts, axis=1))
+    high = -_reach(-chain.high, -np.cumsum(own_high * counts, axis=1))
+    after = np.zeros_like(own_low)
+    after[:, :-1] = own_high[:, 1:] * counts[1:]
+    low = _back(low, after)
+    after[:, :-1] = own_low[:, 1:] * counts[1:]
+    high = -_back(-high, -after)
+    before_low, before_high = np.zeros_like(low), np.zeros_like(high)
+    before_low[:, 1:], before_high[:, 1:] = low[:, :-1], high[:, :-1]
+    lower[:, chain.columns] = np.maximum(own_low, -((before_high - low) // counts))
+    upper[:, chain.columns] = np.minimum(own_high, (high - before_low) // counts)
+
+
+def _running_max(values: np.ndarray) -> np.ndarray:
+    return np.maximum.accumulate(values, axis=1)
+
+
+def _running_max_back(values: np.ndarray) -> np.ndarray:
+    return np.maximum.accumulate(values[:, ::-1], axis=1)[:, ::-1]
+
+
+def _reach(limit: np.ndarray, total: np.ndarray) -> np.ndarray:
+    """Least positions from zero on with moves of sum `total`, never below `limit`."""
+    return total + np.maximum(_running_max(limit - total), 0)
+
+
+def _back(low: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Least positions from which the later ones can be reached: low_b >= low_(b+1) - after_b."""
+    ahead = np.cumsum(after, axis=1) - after  # what all moves before block b's successor add at most
+    return _running_max_back(low - ahead) + ahead
 
 
 def satisfied(chains: list[Chain], moves: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:

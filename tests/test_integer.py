@@ -9,10 +9,13 @@ import pytest
 
 from jaxmpc import status
 from jaxmpc.condense import condense, make_instance
-from jaxmpc.integer import FINISHES, solve_integer
+from jaxmpc.cuts import Cuts
+from jaxmpc.integer import FINISHES, solve_integer, solve_integers
 from jaxmpc.levelset import enumerate_below, exclude
 from jaxmpc.propagation import Chain, nearest, propagate, satisfied
-from jaxmpc.search import Constants, Search
+from jaxmpc.relaxer import Constants, Relaxer
+from jaxmpc.scheduling import run
+from jaxmpc.search import Search
 
 NONE = np.zeros((0, 4)), np.zeros(0), np.zeros(0)
 
@@ -55,6 +58,21 @@ def test_propagation_keeps_every_feasible_move_and_the_dynamic_programme_finds_t
     assert min(feasible_seen, infeasible_seen) > 20
 
 
+def one(tree):
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[None], tree)
+
+
+def started(constants, instance):
+    """A search whose root is solved."""
+    root = Relaxer([constants]).solve_roots(one(instance), one(constants.cold))
+    return Search(constants, instance, root, 1e-6, None)
+
+
+def answered(constants, instance, search, steps):
+    """What a part of a search returns once its problems are solved."""
+    return run(Relaxer([constants]), one(instance), [(0, search, steps)])[0]
+
+
 @pytest.fixture(scope="module")
 def problems(small_structure, small_tuning, well_like_model):
     """Twelve steps near, off and far from the setpoint, with all 3^6 whole plans solved for each."""
@@ -80,10 +98,10 @@ def problems(small_structure, small_tuning, well_like_model):
         free = np.array([11000.0, 185.0]) + np.cumsum(rng.normal(size=(40, 2)) * [60.0, 0.5], axis=0)
         target = np.tile(np.array([11000.0, 185.0]) + spread * rng.normal(size=2) * [900.0, 9.0], (40, 1))
         instance = make(free, target, float(rng.choice([0.0, 50.0, 98.0])))
-        search = Search(constants, instance, 1e-6, None)
+        search = started(constants, instance)
         low, high = (np.round(v[:6]).astype(int) for v in search.limits)
         points = plans[satisfied(search.chains, plans, low, high)]
-        values = search.relax(points, points).objective
+        values = answered(constants, instance, search, search.relax(points, points)).objective
         result.append((constants, instance, points, values))
     return result
 
@@ -91,9 +109,9 @@ def problems(small_structure, small_tuning, well_like_model):
 def test_a_relaxed_solve_bounds_every_whole_plan_and_fixing_loses_no_better_one(problems):
     excluded = 0
     for constants, instance, points, values in problems:
-        search = Search(constants, instance, 1e-6, None)
+        search = started(constants, instance)
         low, high = (np.round(v[:6]).astype(int) for v in search.limits)
-        root = search.relax(low[None], high[None])
+        root = search.root
         model = search.lower_model(root, 0, low, high)
         away = points - model.center
         bound = model.value + model.excess[np.arange(6), points - low].sum(axis=1)
@@ -122,6 +140,36 @@ def test_every_path_finds_the_best_whole_plan_and_proves_it(problems, finish):
         assert result.bound <= best * (1 + 1e-8)
         if finish != "auto":
             assert result.finished_by == finish
+
+
+def test_cuts_at_solved_plans_bound_every_plan_and_touch_their_own(problems):
+    for constants, instance, points, values in problems:
+        search = started(constants, instance)
+        some = points[:: max(len(points) // 5, 1)]
+        result = answered(constants, instance, search, search.relax(some, some))
+        cuts = Cuts(constants)
+        for lane, point in enumerate(some):
+            cuts.add(result, lane, point, point)
+        bounds = cuts.bounds(points)
+        slack = 1e-7 * np.maximum(values, 1.0)  # objective and bound are each right to about 1e-8
+        assert (bounds <= values + slack).all()
+        own = [int(np.flatnonzero((points == p).all(axis=1))[0]) for p in some]
+        assert bounds[own] == pytest.approx(values[own], rel=1e-6, abs=1e-6)
+        assert (bounds > values.min() * 0.5).mean() > 0.2  # they say something about the other plans, too
+
+
+def test_scenarios_solved_together_get_the_answers_they_get_alone(problems):
+    constants = problems[0][0]
+    instances = jax.tree.map(lambda *leaves: np.stack(leaves), *(p[1] for p in problems))
+    cold = jax.tree.map(lambda leaf: np.repeat(leaf[None], len(problems), axis=0), constants.cold)
+    for finish in FINISHES:
+        together = solve_integers(
+            Relaxer([constants]), instances, starts=[[] for _ in problems], warm=cold, finish=finish
+        )
+        for result, (*_, values) in zip(together, problems, strict=True):
+            assert result.status == status.OPTIMAL
+            assert result.value == pytest.approx(values.min(), rel=1e-6)
+            assert result.bound <= values.min() * (1 + 1e-8)
 
 
 def test_a_start_or_prices_from_elsewhere_never_change_the_answer(problems):
