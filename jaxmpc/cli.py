@@ -140,6 +140,41 @@ def _parser() -> argparse.ArgumentParser:
     )
     thesis.add_argument("--quick", action="store_true", help="a shortened reference, under two minutes")
     thesis.add_argument("--plant", choices=PLANTS, default="fmu", help="drive the FMU or its JAX twin")
+
+    bench = command(
+        commands,
+        "bench",
+        _bench,
+        "Time our solvers beside others on recorded samples of the thesis run, and check every solution.",
+        epilog="Times are wall times [ms] or [s], rates are per second. The other solvers come with pip install "
+        "'jaxmpc[bench]'; one that is not installed is named as missing. Ctrl-C prints what was measured so far. "
+        "Exit status: 0 done, 2 bad input, 1 stopped early or one of our solutions is wrong.",
+    )
+    bench.add_argument(
+        "--quick",
+        action="store_true",
+        help="a few samples of a short run, about two minutes in place of twelve",
+    )
+    bench.add_argument(
+        "--only",
+        metavar="SECTION[,SECTION]",
+        default=argparse.SUPPRESS,
+        help="what to measure: relaxed, batch, exact, loop, growth, startup, gpu (default: all)",
+    )
+    bench.add_argument(
+        "--json",
+        metavar="FILE",
+        type=Path,
+        default=argparse.SUPPRESS,
+        help="where to write every row (default: nowhere)",
+    )
+    bench.add_argument(
+        "--figures",
+        metavar="DIR",
+        type=Path,
+        default=argparse.SUPPRESS,
+        help="where to draw time per sample over the run and rate over batch size (default: nowhere)",
+    )
     return parser
 
 
@@ -250,6 +285,25 @@ def _study_thesis(options: argparse.Namespace) -> int:
     draw_all(folder)
     print(f"Summary: {folder / 'summary.md'}, figures: {folder / 'figures'}")
     return EXIT_OPTIMAL
+
+
+def _bench(options: argparse.Namespace) -> int:
+    only = getattr(options, "only", None)
+    out, folder = getattr(options, "json", None), getattr(options, "figures", None)
+    if out is not None:
+        _check_writable("--json", out)
+    if folder is not None:
+        _check_writable("--figures", folder / "figure")
+    from studies.bench.run import run_bench, table, wrong
+
+    report = run_bench(quick=options.quick, only=only, json_path=out)
+    print(table(report), end="", flush=True)
+    if folder is not None:
+        from figures.benchmark import draw_benchmark
+
+        for path in draw_benchmark(json.loads(report.to_json()), folder):
+            print(path, file=sys.stderr)
+    return EXIT_OPTIMAL if report.complete and not wrong(report) else EXIT_OTHER
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
 """Closed loops (thesis chapter 7): a controller, a plant and a reference make a `Trajectory`.
 
-A continuous controller on the JAX well runs as one compiled scan, and `simulate_batch` runs many at once. Everything else
-(the FMU, integer moves) steps on the host with the very same controller code.
+A continuous controller on the JAX well runs as one compiled scan, and `simulate_batches` runs many side by side, some lanes
+and some samples at a time. Everything else (the FMU, integer moves) steps on the host with the very same controller code.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -15,13 +15,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.controller import ContinuousController, ControllerState, MixedIntegerController, StepInfo
+from jaxmpc.batch import Lanes, for_all, map_lanes, per_lane, place, variant_mesh
+from jaxmpc.controller import ContinuousController, ControllerState, StepInfo
 from jaxmpc.errors import InputError
+from jaxmpc.mixed_integer import MixedIntegerController, MixedIntegerControllers
+from jaxmpc.noise import check_deviation, check_seed, noise_samples
 from jaxmpc.plant import WellPlant
 from jaxmpc.reference import Reference
-from jaxmpc.trajectory import Trajectory
+from jaxmpc.structure import Structure
+from jaxmpc.sweep import Sweep, check_match, check_offsets, sampled
+from jaxmpc.together import advance_together
+from jaxmpc.trajectory import RECORDABLE, Trajectory, TrajectoryBatch
 
 CHUNK = 300  # samples between two progress reports of a compiled loop
+LANES = 256  # of a sweep that run side by side
 Progress = Callable[[int, int], None]
 
 
@@ -32,6 +39,8 @@ def simulate(
     *,
     samples: int | None = None,
     disturbance=None,
+    noise=None,
+    seed: int = 0,
     progress: Progress | None = None,
 ) -> Trajectory:
     """Close the loop from the plant's steady state at its default working point.
@@ -42,146 +51,41 @@ def simulate(
         reference: setpoints, covering the run.
         samples: length of the run; the whole reference if not given.
         disturbance: reservoir-pressure offset per sample [bar], ``"sample"``; none if not given.
+        noise: standard deviation of the measurement noise, ``"cv"`` [CV unit]; none if not given.
+        seed: of the noise.
         progress: called with ``(done, total)`` samples.
 
     Returns:
-        `Trajectory`.
+        `Trajectory`; its CVs are what was measured, noise included.
 
     Raises:
-        InputError: if sampling intervals differ, the reference has other CVs or ends before the run, or the disturbance
-            has not one finite value per sample.
+        InputError: if sampling intervals differ, the reference has other CVs or ends before the run, the disturbance
+            has not one finite value per sample, or the noise not one standard deviation per CV.
     """
     structure = controller.structure
-    if abs(plant.dt - structure.dt) > 1e-9 * structure.dt:
-        raise InputError("plant.dt", plant.dt, f"the controller's sampling interval {structure.dt} s")
-    if reference.cv_count != structure.cv_count:
-        raise InputError(
-            "reference.setpoints",
-            f"{reference.cv_count} columns",
-            f"one per CV: {', '.join(structure.cv_names)}",
-        )
-    setpoints = reference.sample(structure.dt, samples)
+    check_match(structure, plant)
+    setpoints = sampled(reference, structure, samples)
     offsets = np.zeros(len(setpoints)) if disturbance is None else np.asarray(disturbance, dtype=np.float64)
-    if offsets.shape != (len(setpoints),) or not np.isfinite(offsets).all():
-        raise InputError(
-            "disturbance",
-            f"shape {list(offsets.shape)}",
-            f"{len(setpoints)} finite offsets [bar], one per sample",
-        )
+    check_offsets(offsets, (len(setpoints),))
+    deviation, stream = check_deviation(noise, structure.cv_count), check_seed(seed)
+    if deviation.ndim > 1 or stream.ndim:
+        raise InputError("noise", noise, "one standard deviation per CV and one seed, for one run")
+    errors = np.asarray(_noise(deviation, stream, 0, np.arange(len(setpoints))))
+    inputs = setpoints, offsets, errors
     if isinstance(plant, WellPlant) and isinstance(controller, ContinuousController):
-        record = _simulate_compiled(controller, plant, setpoints, offsets, progress)
+        record = _simulate_compiled(controller, plant, inputs, progress)
     else:
-        record = _simulate_on_host(controller, plant, setpoints, offsets, progress)
-    return _trajectory(structure, setpoints, record)
+        record = _simulate_on_host(controller, plant, inputs, progress)
+    return Trajectory(setpoint=setpoints, **record, **_labels(structure, len(setpoints)))
 
 
-def _step_loop(controller: ContinuousController, plant: WellPlant, carry, inputs):
-    """One sample of a compiled loop: measure, decide, advance the plant."""
-    state, plant_state, cv = carry
-    setpoint, offset = inputs
-    state, info = controller.step(state, cv, setpoint)
-    plant_state, outputs = plant.step(plant_state, state.mv, offset)
-    record = (cv, outputs.mv, state.bias, state.bias_raw, eqx.tree_at(lambda i: i.moves, info, None))
-    return (state, plant_state, outputs.cv), record
+_noise = jax.jit(noise_samples)
 
 
-@eqx.filter_jit
-def _run_chunk(controller: ContinuousController, plant: WellPlant, carry, setpoints, offsets):
-    return jax.lax.scan(lambda c, i: _step_loop(controller, plant, c, i), carry, (setpoints, offsets))
-
-
-def _start(controller: ContinuousController, plant: WellPlant):
-    plant_state = plant.init()
-    outputs = plant.measure(plant_state)
-    return controller.init(outputs.cv, outputs.mv), plant_state, outputs.cv
-
-
-def _simulate_compiled(controller, plant, setpoints, offsets, progress: Progress | None):
-    carry = _start(controller, plant)
-    total, parts = len(setpoints), []
-    ready: set[int] = set()
-    for begin in range(0, total, CHUNK):
-        inputs = setpoints[begin : begin + CHUNK], offsets[begin : begin + CHUNK]
-        count = len(inputs[0])
-        if count not in ready:  # compile before the clock starts
-            _run_chunk.lower(controller, plant, carry, *inputs).compile()
-            ready.add(count)
-        started = time.perf_counter()
-        carry, record = jax.block_until_ready(_run_chunk(controller, plant, carry, *inputs))
-        # a compiled loop has no clock: every sample of a chunk gets the chunk's mean, plant included
-        mean = (time.perf_counter() - started) / count
-        record = jax.tree.map(np.asarray, record)
-        parts.append(eqx.tree_at(lambda r: r[4].solve_time, record, np.full(count, mean)))
-        if progress is not None:
-            progress(begin + count, total)
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-
-
-class _HostWell:
-    """The JAX well behind the interface of a stateful plant."""
-
-    def __init__(self, plant: WellPlant):
-        self.plant, self.dt = plant, plant.dt
-        self._step = eqx.filter_jit(WellPlant.step)
-
-    def init(self):
-        self.state = self.plant.init()
-        return self.plant.measure(self.state)
-
-    def step(self, mv, disturbance: float = 0.0):
-        self.state, outputs = self._step(self.plant, self.state, jnp.asarray(mv), jnp.asarray(disturbance))
-        return outputs
-
-
-_jitted_step: Any = eqx.filter_jit(ContinuousController.step)
-
-
-def _simulate_on_host(controller, plant, setpoints, offsets, progress: Progress | None):
-    host = _HostWell(plant) if isinstance(plant, WellPlant) else plant
-    outputs = host.init()
-    state: ControllerState = controller.init(np.asarray(outputs.cv), np.asarray(outputs.mv))
-    compiled = isinstance(controller, ContinuousController)
-    if compiled:  # compile before the clock starts
-        jax.block_until_ready(_jitted_step(controller, state, np.asarray(outputs.cv), setpoints[0]))
-    records = []
-    for k in range(len(setpoints)):
-        cv = np.asarray(outputs.cv)
-        begin = time.perf_counter()
-        if compiled:
-            state, info = jax.block_until_ready(_jitted_step(controller, state, cv, setpoints[k]))
-            elapsed = time.perf_counter() - begin
-        else:
-            state, info = controller.step(state, cv, setpoints[k])
-            elapsed = float(info.solve_time)
-        outputs = host.step(np.asarray(state.mv), float(offsets[k]))
-        info: StepInfo = eqx.tree_at(lambda i: (i.moves, i.solve_time), info, (None, np.float64(elapsed)))
-        records.append(
-            jax.tree.map(np.asarray, (cv, np.asarray(outputs.mv), state.bias, state.bias_raw, info))
-        )
-        if progress is not None and ((k + 1) % 20 == 0 or k + 1 == len(setpoints)):
-            progress(k + 1, len(setpoints))
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *records)
-
-
-def _trajectory(structure, setpoints, record) -> Trajectory:
-    cv, mv, bias, bias_raw, info = record
-    return Trajectory(
-        time=np.arange(len(setpoints)) * structure.dt,
-        setpoint=setpoints,
-        cv=cv,
-        mv_demand=info.mv,
-        mv=mv,
-        move=info.move,
-        bias=bias,
-        bias_raw=bias_raw,
-        status=info.status,
-        fallback=info.fallback,
-        objective=info.objective,
-        bound=info.bound,
-        gap=info.gap,
-        nodes=info.nodes,
-        solve_time=info.solve_time,
-        finished_by=info.finished_by,
+def _labels(structure: Structure, samples: int) -> dict[str, Any]:
+    """The fields of a trajectory that follow from the structure."""
+    return dict(
+        time=np.arange(samples) * structure.dt,
         cv_names=structure.cv_names,
         mv_names=structure.mv_names,
         cv_units=structure.cv_units,
@@ -190,44 +94,266 @@ def _trajectory(structure, setpoints, record) -> Trajectory:
     )
 
 
-def simulate_batch(
-    controllers: ContinuousController,
-    plants: WellPlant,
-    reference: Reference,
+def _record(cv, mv, state: ControllerState, info: StepInfo) -> dict[str, Any]:
+    """What a sample leaves behind, by the names of `Trajectory`; a compiled loop has no solve time yet."""
+    return dict(
+        cv=cv,
+        mv_demand=info.mv,
+        mv=mv,
+        move=info.move,
+        bias=state.bias,
+        bias_raw=state.bias_raw,
+        status=info.status,
+        fallback=info.fallback,
+        objective=info.objective,
+        bound=info.bound,
+        gap=info.gap,
+        nodes=info.nodes,
+        finished_by=info.finished_by,
+    )
+
+
+# ------------------------------------------------------------------------------------------------ compiled
+
+
+def _start(controller: ContinuousController, plant: WellPlant):
+    plant_state = plant.init()
+    outputs = plant.measure(plant_state)
+    return controller.init(outputs.cv, outputs.mv), plant_state, outputs.cv
+
+
+def _scan(controller: ContinuousController, plant: WellPlant, carry, inputs, recorded=RECORDABLE):
+    """Some samples of a compiled loop: measure, decide, advance the plant."""
+
+    def one(carry, inputs):
+        state, plant_state, cv = carry
+        setpoint, offset, error = inputs
+        measured = cv + error
+        state, info = controller.step(state, measured, setpoint)
+        plant_state, outputs = plant.step(plant_state, state.mv, offset)
+        record = _record(measured, outputs.mv, state, info)
+        return (state, plant_state, outputs.cv), {k: v for k, v in record.items() if k in recorded}
+
+    return jax.lax.scan(one, carry, inputs)
+
+
+_run_chunk: Any = eqx.filter_jit(_scan)
+
+
+def _simulate_compiled(controller, plant, inputs, progress: Progress | None):
+    carry = _start(controller, plant)
+    total, parts = len(inputs[0]), []
+    ready: set[int] = set()
+    for begin in range(0, total, CHUNK):
+        now = jax.tree.map(lambda leaf, at=begin: leaf[at : at + CHUNK], inputs)
+        count = len(now[0])
+        if count not in ready:  # compile before the clock starts
+            _run_chunk.lower(controller, plant, carry, now).compile()
+            ready.add(count)
+        started = time.perf_counter()
+        carry, record = jax.block_until_ready(_run_chunk(controller, plant, carry, now))
+        # a compiled loop has no clock: every sample of a chunk gets the chunk's mean, plant included
+        mean = (time.perf_counter() - started) / count
+        parts.append(jax.tree.map(np.asarray, record) | {"solve_time": np.full(count, mean)})
+        if progress is not None:
+            progress(begin + count, total)
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+# ------------------------------------------------------------------------------------------------- on the host
+
+
+class _HostWell:
+    """The JAX well behind the interface of a stateful plant."""
+
+    def __init__(self, plant: WellPlant):
+        self.plant, self.dt = plant, plant.dt
+        self._on_device = jax.tree.map(jnp.asarray, plant)  # numbers would be sent over at every sample
+
+    def init(self):
+        self.state = self.plant.init()
+        return self.plant.measure(self.state)
+
+    def step(self, mv, disturbance: float = 0.0):
+        self.state, outputs = _advance(self._on_device, self.state, mv, disturbance)
+        return outputs
+
+
+_advance: Any = jax.jit(WellPlant.step)
+_jitted_step: Any = eqx.filter_jit(ContinuousController.step)
+
+
+def _simulate_on_host(controller, plant, inputs, progress: Progress | None):
+    setpoints, offsets, errors = inputs
+    host = _HostWell(plant) if isinstance(plant, WellPlant) else plant
+    outputs = host.init()
+    state: ControllerState = controller.init(np.asarray(outputs.cv), np.asarray(outputs.mv))
+    compiled = isinstance(controller, ContinuousController)
+    if compiled:  # compile before the clock starts
+        jax.block_until_ready(_jitted_step(controller, state, np.asarray(outputs.cv), setpoints[0]))
+    records = []
+    for k in range(len(setpoints)):
+        cv = np.asarray(outputs.cv) + errors[k]
+        begin = time.perf_counter()
+        if compiled:
+            state, info = jax.block_until_ready(_jitted_step(controller, state, cv, setpoints[k]))
+            elapsed = time.perf_counter() - begin
+        else:
+            state, info = controller.step(state, cv, setpoints[k])
+            elapsed = float(info.solve_time)
+        outputs = host.step(np.asarray(state.mv), float(offsets[k]))
+        record = _record(cv, outputs.mv, state, info) | {"solve_time": elapsed}
+        records.append(jax.tree.map(np.asarray, record))
+        if progress is not None and ((k + 1) % 20 == 0 or k + 1 == len(setpoints)):
+            progress(k + 1, len(setpoints))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *records)
+
+
+# ------------------------------------------------------------------------------------------------------- sweeps
+
+
+def simulate_batch(*arguments: Any, **options: Any) -> list[Trajectory]:
+    """Many closed loops at once: arguments of `simulate_batches`, result one `Trajectory` per lane.
+
+    All trajectories are kept, 170 bytes per sample and lane; larger sweeps consume `simulate_batches` piece by piece.
+    """
+    return [run for batch in simulate_batches(*arguments, **options) for run in batch.trajectories()]
+
+
+def simulate_batches(
+    controllers: Lanes[ContinuousController] | ContinuousController | MixedIntegerControllers,
+    plants: Lanes[WellPlant] | WellPlant,
+    reference: Reference | Sequence[Reference],
     *,
-    batched: tuple[bool, bool] = (True, False),
     samples: int | None = None,
+    disturbance=None,
+    noise=None,
+    seed=0,
+    record: Sequence[str] = RECORDABLE,
+    lanes_at_once: int = LANES,
+    devices: Sequence[Any] | None = None,
     progress: Progress | None = None,
-) -> list[Trajectory]:
-    """Many continuous closed loops on the JAX well at once, in one compiled and vmapped program.
+) -> Iterator[TrajectoryBatch]:
+    """Closed loops on the JAX well, `lanes_at_once` side by side in one compiled program, piece by piece.
+
+    What is given once is shared by all lanes; anything may have one value per lane instead. A piece is complete in
+    time; when the next one is asked for, nothing of it is kept here, so that memory does not grow with the sweep.
+    Results depend neither on the size of the pieces nor on the number of devices.
 
     Args:
-        controllers: a batch of controllers of one structure, made with `eqx.filter_vmap` (arrays have a first batch axis).
-        plants: one well, or a batch of wells.
-        reference: setpoints, the same for all.
-        batched: whether the controllers and the plants have a batch axis.
-        samples: length of the run; the whole reference if not given.
-        progress: called with ``(done, total)`` samples.
+        controllers: one, or `Lanes` such as those of `batch.controller_batch`; or `MixedIntegerControllers`, which advance
+            together, all in one piece.
+        plants: one well, or `Lanes` of wells (`batch.per_lane`).
+        reference: setpoints for all, or a list with one reference per lane.
+        samples: length of the runs; the whole (shortest) reference if not given.
+        disturbance: reservoir-pressure offset [bar], ``"sample"`` or ``"lane sample"``; none if not given.
+        noise: standard deviation of the measurement noise [CV unit], ``"cv"`` or ``"lane cv"``; none if not given.
+        seed: of the noise. One number gives every lane noise of its own. With one number per lane, lanes with equal
+            seeds get equal noise, which is that of `simulate` with this seed.
+        record: names of the fields of `Trajectory` to keep; the others are never stored.
+        lanes_at_once: lanes of one piece; fewer where the lanes then divide evenly. Each size compiles once.
+        devices: to spread the lanes over; all of this process if not given.
+        progress: called with ``(done, total)`` samples of all lanes, first when compilation is over.
 
     Returns:
-        One `Trajectory` per lane.
+        Iterator of `TrajectoryBatch`, in lane order.
+
+    Raises:
+        InputError: at once, for what `simulate` refuses, lane counts that differ, or no lanes at all.
     """
-    structure = controllers.structure
-    setpoints = reference.sample(structure.dt, samples)
-    axes = tuple(eqx.if_array(0) if flag else None for flag in batched)
-    carry = eqx.filter_vmap(_start, in_axes=axes)(controllers, plants)
-    run = eqx.filter_jit(eqx.filter_vmap(_run_chunk, in_axes=(*axes, eqx.if_array(0), None, None)))
-    parts, total = [], len(setpoints)
-    for begin in range(0, total, CHUNK):
-        started = time.perf_counter()
-        part = setpoints[begin : begin + CHUNK]
-        carry, record = jax.block_until_ready(run(controllers, plants, carry, part, np.zeros(len(part))))
-        record = jax.tree.map(np.asarray, record)
-        lanes = record[0].shape[0]
-        mean = np.full((lanes, len(part)), (time.perf_counter() - started) / (len(part) * lanes))
-        parts.append(eqx.tree_at(lambda r: r[4].solve_time, record, mean))
+    sweep = Sweep.checked(controllers, plants, reference, samples, disturbance, noise, seed)
+    unknown = [field for field in record if field not in RECORDABLE]
+    if unknown:
+        raise InputError("record", unknown[0], f"some of {', '.join(RECORDABLE)}")
+    if lanes_at_once < 1:
+        raise InputError("lanes_at_once", lanes_at_once, "1 or more lanes")
+    return _pieces(sweep, tuple(record), lanes_at_once, variant_mesh(devices), progress)
+
+
+def _even(total: int, most: int, multiple: int = 1) -> int:
+    """Size of equal pieces of at most `most` (or `multiple`), a multiple of `multiple`, that cover `total`."""
+    most = max(most // multiple, 1)
+    units = -(-total // multiple)
+    return multiple * -(-units // -(-units // most))
+
+
+def _pieces(sweep: Sweep, record, lanes_at_once: int, mesh, progress) -> Iterator[TrajectoryBatch]:
+    done = 0
+
+    def tick(samples: int):
+        nonlocal done
+        done += samples
         if progress is not None:
-            progress(begin + len(part), total)
-    whole = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *parts)
-    lanes = whole[0].shape[0]
-    return [_trajectory(structure, setpoints, jax.tree.map(lambda v, i=i: v[i], whole)) for i in range(lanes)]
+            progress(done, sweep.count * sweep.samples)
+
+    if isinstance(sweep.controllers, MixedIntegerControllers):
+        everyone = np.arange(sweep.count)
+        inputs = sweep.setpoints_of(everyone), sweep.offsets_of(everyone)
+        noise = sweep.deviation, sweep.seeds
+
+        def keep(cv, mv, state, info):
+            fields = _record(cv, mv, state, info) | {"solve_time": info.solve_time}
+            return {name: value for name, value in fields.items() if name in record}
+
+        yield TrajectoryBatch(
+            lanes=everyone,
+            setpoint=inputs[0],
+            fields=advance_together(sweep.controllers, sweep.plants, inputs, noise, keep, tick),
+            **_labels(sweep.structure, sweep.samples),
+        )
+        return
+    size = _even(sweep.count, lanes_at_once, mesh.size)
+    whole = sweep.controllers, sweep.plants
+    common = [place(for_all(lanes.shared), mesh).shared for lanes in whole]
+    for begin in range(0, sweep.count, size):
+        # the last piece is filled up with copies of the last lane: one shape, one compilation
+        index = np.minimum(np.arange(begin, begin + size), sweep.count - 1)
+        real = min(size, sweep.count - begin)
+        yield TrajectoryBatch(  # no name keeps it: it is gone when the caller lets go
+            lanes=index[:real],
+            setpoint=sweep.setpoints_of(index[:real]),
+            fields=_run_piece(sweep, whole, common, index, real, record, mesh, tick),
+            **_labels(sweep.structure, sweep.samples),
+        )
+
+
+def _run_piece(sweep: Sweep, whole, common, index, real: int, record, mesh, tick) -> dict[str, np.ndarray]:
+    """Recorded fields "lane sample ..." of the first `real` of some lanes."""
+    put = lambda lanes: place(lanes, mesh)  # noqa: E731
+    own = [lanes.take(index).each for lanes in whole]
+    loop = [put(Lanes(each, shared)) for each, shared in zip(own, common, strict=True)]
+    seeds, deviation = put(per_lane(sweep.seeds[index])), put(per_lane(sweep.deviation[index]))
+    carry = map_lanes(_start, loop, mesh)
+    setpoints, offsets = sweep.setpoints_of(index), sweep.offsets_of(index)
+    length = _even(sweep.samples, CHUNK)
+    fields: dict[str, np.ndarray] = {}
+    for begin in range(0, sweep.samples, length):
+        # samples beyond the end are simulated and dropped, for the sake of one shape
+        now = np.minimum(np.arange(begin, begin + length), sweep.samples - 1)
+        count = min(length, sweep.samples - begin)
+        inputs = put(per_lane((setpoints[:, now], offsets[:, now])))
+        which = put(for_all(jnp.asarray(begin)))
+        arguments = [*loop, per_lane(carry), inputs, seeds, deviation, which, for_all(record)]
+        if index[0] == 0 and begin == 0:  # compile before the clock starts
+            map_lanes.lower(_window, arguments, mesh).compile()
+            tick(0)
+        started = time.perf_counter()
+        carry, part = jax.block_until_ready(map_lanes(_window, arguments, mesh))
+        # as in one compiled loop: every sample gets the mean of its chunk, and lanes share the time equally
+        mean = (time.perf_counter() - started) / (length * len(index))
+        part = {name: np.asarray(value) for name, value in part.items()}
+        if "solve_time" in record:
+            part["solve_time"] = np.full((len(index), length), mean)
+        for name, value in part.items():
+            if name not in fields:
+                fields[name] = np.empty((real, sweep.samples, *value.shape[2:]), dtype=value.dtype)
+            fields[name][:, begin : begin + count] = value[:real, :count]
+        tick(real * count)
+    return fields
+
+
+def _window(controller, plant, carry, inputs, seed, deviation, begin, record):
+    """Some samples of one lane, the first of them number `begin`."""
+    setpoints, offsets = inputs
+    errors = noise_samples(deviation, seed[0], seed[1], begin + jnp.arange(len(setpoints)))
+    return _scan(controller, plant, carry, (setpoints, offsets, errors), record)

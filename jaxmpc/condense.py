@@ -36,9 +36,12 @@ class CondensedQp(eqx.Module):
     """What stays constant from sample to sample; `rows` are the penalised predictions (CV-major) followed by the
     envelope rows of the integer moves, `n` the scaled moves (MV-major).
 
+    `response` and `packed` follow from the structure and the model alone: a batch of tunings shares them, and the Newton
+    matrices of all its lanes are one matrix product. What the tuning scales is kept apart in `scale`.
+
     Attributes:
-        theta: rows of t = theta x + t0.
-        packed: products theta[:, i] * theta[:, j] for i <= j, or None where too large.
+        response: rows of t per MV unit of every move.
+        packed: products response[:, i] * response[:, j] for i <= j, or None where too large.
         hessian: H of the quadratic part without the integer moves' own weight if an envelope is used.
         curvature: H with that weight included (valid at integer moves only).
         move_weight: weight of x^2 that `hessian` holds, 0 where an envelope takes its place.
@@ -48,7 +51,7 @@ class CondensedQp(eqx.Module):
         scale: MV units per unit of x.
     """
 
-    theta: Float[Array, "row n"]
+    response: Float[Array, "row n"]
     packed: Float[Array, "row pair"] | None
     hessian: Float[Array, "n n"]
     curvature: Float[Array, "n n"]
@@ -60,6 +63,11 @@ class CondensedQp(eqx.Module):
     slack_weight: Float[Array, " cv"]
     scale: Float[Array, " n"]
     has_limits: bool = eqx.field(static=True)
+
+    @property
+    def theta(self) -> Float[Array, "row n"]:
+        """Rows of t = theta x + t0; one copy per lane where tunings are batched, so not for the solvers."""
+        return self.response * self.scale[..., None, :]
 
 
 class QpInstance(eqx.Module):
@@ -133,7 +141,7 @@ def condense(
         envelope: largest whole number of steps an integer move can make, for the envelope of its weight; 0 keeps the
             plain square.
         has_limits: whether any CV limit is finite (static; False drops their rows from the solver).
-        packed: whether to keep the packed products of `theta` (up to 64 variables).
+        packed: whether to keep the packed products of the responses (up to 64 variables).
     """
     blocks, mvs, rows = (
         structure.block_count,
@@ -146,11 +154,12 @@ def condense(
     per_cv = lambda values: jnp.repeat(values, structure.horizon_count)  # noqa: E731
     quadratic = per_cv(tuning.cv_weight)
     weight = counts * jnp.repeat(tuning.move_weight, blocks)  # paid at every sample of the block
-    curvature = 2.0 * jnp.sum(raw * (quadratic[:, None] * raw), axis=0) + 2.0 * weight
-    scale = _variable_scale(structure, tuning, curvature)
-    theta = raw * scale
+    by_cv = full.reshape(structure.cv_count, -1, mvs * blocks)
+    per_weight = jnp.einsum("cji,cjk->cik", by_cv, by_cv)  # shared by a batch of tunings
+    tracking = 2.0 * jnp.einsum("c,cik->ik", tuning.cv_weight, per_weight)
+    scale = _variable_scale(structure, tuning, jnp.diagonal(tracking) + 2.0 * weight)
     weight = weight * scale**2
-    tracking = 2.0 * theta.T @ (quadratic[:, None] * theta)
+    tracking = tracking * scale[:, None] * scale[None, :]
     integer = integer_columns(structure)
     own = np.ones(mvs * blocks)
     if envelope:
@@ -158,16 +167,18 @@ def condense(
     else:
         integer = integer[:0]
     steps = np.arange(max(envelope, 1))
-    unit = jnp.zeros((len(integer), mvs * blocks)).at[np.arange(len(integer)), integer].set(1.0)
+    unit = np.zeros((len(integer), mvs * blocks))  # one step
+    unit[np.arange(len(integer)), integer] = [
+        1.0 / (structure.integer_step[c // blocks] or 1.0) for c in integer
+    ]
     extra = len(integer) * len(steps)
-    theta = jnp.concatenate([theta, jnp.tile(unit, (len(steps), 1))])
+    response = jnp.concatenate([raw, np.tile(unit, (len(steps), 1))])
     pad = lambda values, tail: jnp.concatenate([values, tail])  # noqa: E731
     slope = jnp.concatenate([(1.0 if m == 0 else 2.0) * weight[integer] for m in steps])
-    first, second = np.triu_indices(mvs * blocks)
     pay = packed and mvs * blocks <= PACKED_LIMIT
     return CondensedQp(
-        theta=theta,
-        packed=theta[:, first] * theta[:, second] if pay else None,
+        response=response,
+        packed=packed_products(response) if pay else None,
         hessian=tracking + jnp.diag(2.0 * weight * own),
         curvature=tracking + jnp.diag(2.0 * weight),
         move_weight=weight * own,
@@ -179,6 +190,12 @@ def condense(
         scale=scale,
         has_limits=has_limits,
     )
+
+
+def packed_products(response: Float[Array, "row n"]) -> Float[Array, "row pair"]:
+    """Products of the columns i <= j, so that response' diag(w) response is one product w @ packed."""
+    first, second = np.triu_indices(response.shape[-1])
+    return response[:, first] * response[:, second]
 
 
 def _variable_scale(structure: Structure, tuning: Tuning, curvature) -> Float[Array, " n"]:
@@ -223,7 +240,7 @@ def make_instance(
     blocks = structure.block_count
     spread = lambda values: jnp.asarray(values)[first:].T.reshape(-1)  # noqa: E731
     target = spread(setpoint)
-    extra = qp.theta.shape[0] - target.shape[0]
+    extra = qp.response.shape[0] - target.shape[0]
     per_cv = lambda values: jnp.repeat(values, structure.horizon_count)  # noqa: E731
     scale = qp.scale.reshape(structure.mv_count, blocks)[:, 0]
     counts = jnp.asarray(moves_per_block(structure), dtype=float)

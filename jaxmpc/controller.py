@@ -7,24 +7,19 @@ gives no plan holds the MVs, and the info says so.
 
 from __future__ import annotations
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmpc import status as codes
 from jaxmpc.blocking import block_members, first_position_rows, hard_rows, moves_per_block, sample_moves
-from jaxmpc.condense import CondensedQp, condense, make_instance
+from jaxmpc.condense import CondensedQp, QpInstance, condense, make_instance
 from jaxmpc.disturbance import filter_bias
 from jaxmpc.errors import InputError
-from jaxmpc.integer import FINISHES
 from jaxmpc.newton import WarmStart, warm_start_of
-from jaxmpc.plan import Plan, Planner, check_match, check_vector
 from jaxmpc.relaxation import cold_start, shifted_start, solve_relaxed
-from jaxmpc.step_response import StepResponseModel, advance_free_response, shift_free_response
+from jaxmpc.step_response import StepResponseModel, advance_free_response, check_match, shift_free_response
 from jaxmpc.structure import Structure
 from jaxmpc.tuning import Tuning
 
@@ -85,7 +80,7 @@ class StepInfo(eqx.Module):
     solve_time: Float[Array, ""]
 
 
-class _Memory(eqx.Module):
+class Memory(eqx.Module):
     """Prediction and bookkeeping shared by the controllers."""
 
     structure: Structure = eqx.field(static=True)
@@ -159,6 +154,18 @@ def outside_limits(tuning: Tuning, mv: Float[Array, " mv"]) -> Bool[Array, ""]:
     return jnp.any((mv < tuning.mv_low - drift) | (mv > tuning.mv_high + drift))
 
 
+def first_move(structure: Structure, qp: CondensedQp, instance: QpInstance, move: Float[Array, " mv"]):
+    """The move to apply [MV unit]: solver tolerance must not leave what the limits allow the first block."""
+    blocks = structure.block_count
+    unit = qp.scale[::blocks]
+    low, high = instance.lower[::blocks], instance.upper[::blocks]
+    first = first_position_rows(structure)
+    held = moves_per_block(structure)[0]
+    low = jnp.maximum(low, instance.row_low[first] / held)
+    high = jnp.minimum(high, instance.row_high[first] / held)
+    return jnp.clip(move / unit, low, high) * unit
+
+
 class ContinuousController(eqx.Module):
     """MPC with continuous moves (thesis chapter 5 with 6.2-6.4, 6.6); pure, so that it can be jitted, vmapped, scanned.
 
@@ -169,7 +176,7 @@ class ContinuousController(eqx.Module):
         packed: keep the packed products of the dynamic matrix; pays for batches of 16 or more that share it.
     """
 
-    memory: _Memory
+    memory: Memory
     qp: CondensedQp
 
     def __init__(
@@ -183,7 +190,7 @@ class ContinuousController(eqx.Module):
                 "Use MixedIntegerController, or structure.relaxed()",
             )
         check_match(structure, model)
-        self.memory = _Memory(
+        self.memory = Memory(
             structure, tuning, model.extended(max(structure.prediction_horizon, model.samples))
         )
         self.qp = condense(structure, tuning, model.coefficients, envelope=0, packed=packed)
@@ -234,17 +241,7 @@ class ContinuousController(eqx.Module):
         scale = jnp.maximum(jnp.abs(objective), 1e-6 * jnp.max(jnp.diagonal(self.qp.curvature)))
         gap = (objective - bound) / scale
         good = (solution.status == codes.OPTIMAL) & jnp.all(jnp.isfinite(moves)) & jnp.all(jnp.isfinite(cv))
-        # solver tolerance must not leave the limits: the applied move is cut to what the first block may do
-        blocks = structure.block_count
-        unit = self.qp.scale[::blocks]
-        low, high = instance.lower[::blocks], instance.upper[::blocks]
-        first = first_position_rows(structure)
-        end_low, end_high = instance.row_low[first], instance.row_high[first]
-        held = moves_per_block(structure)[0]
-        move = (
-            jnp.clip(moves[0] / unit, jnp.maximum(low, end_low / held), jnp.minimum(high, end_high / held))
-            * unit
-        )
+        move = first_move(structure, self.qp, instance, moves[0])
         move = jnp.where(good, move, 0.0)
         moves = jnp.where(good, moves, 0.0)
         recovering = outside_limits(tuning, state.mv)
@@ -266,120 +263,3 @@ class ContinuousController(eqx.Module):
             solve_time=jnp.asarray(jnp.nan),
         )
         return state, info
-
-
-class MixedIntegerController:
-    """MPC with whole moves of the integer MVs (thesis chapter 6); runs on the host, solves exactly.
-
-    Args:
-        structure: static configuration with at least one integer MV.
-        tuning: weights and limits.
-        model: step-response model.
-        gap: relative gap of a solve.
-        time_limit: seconds per solve, None for none.
-        finish: path that closes the integer problem, see `jaxmpc.integer`.
-    """
-
-    def __init__(
-        self,
-        structure: Structure,
-        tuning: Tuning,
-        model: StepResponseModel,
-        *,
-        gap: float = 1e-6,
-        time_limit: float | None = None,
-        finish: str = "auto",
-    ):
-        if not structure.integer_mvs:
-            raise InputError(
-                "structure.integer_step",
-                list(structure.integer_step),
-                "at least one integer MV",
-                "Use ContinuousController for continuous moves",
-            )
-        if finish not in FINISHES:
-            raise InputError("finish", finish, f"one of {', '.join(FINISHES)}")
-        self.planner = Planner(structure, tuning, model)
-        self.memory = _Memory(
-            structure, tuning, model.extended(max(structure.prediction_horizon, model.samples))
-        )
-        self.gap, self.time_limit, self.finish = gap, time_limit, finish
-
-    @property
-    def structure(self) -> Structure:
-        """Static configuration."""
-        return self.memory.structure
-
-    @property
-    def tuning(self) -> Tuning:
-        """Weights and limits."""
-        return self.memory.tuning
-
-    def init(self, cv, mv) -> ControllerState:
-        """State at a steady state with measured CVs and present MVs (engineering units)."""
-        check_vector("cv", cv, self.structure.cv_names, "CV unit")
-        check_vector("mv", mv, self.structure.mv_names, "MV unit")
-        constants = self.planner.constants(1)
-        return self.memory.init(cv, mv, cold_start(constants.qp, len(constants.rows)))
-
-    def step(self, state: ControllerState, cv, setpoint) -> tuple[ControllerState, StepInfo]:
-        """One sample; arguments as in `ContinuousController.step`."""
-        state, free_response = _observe(self.memory, state, jnp.asarray(cv))
-        if not np.isfinite(np.asarray(cv)).all():
-            return self._after(state, None)
-        plan = self.planner.solve(
-            mv_now=state.mv,
-            last_move=state.last_move,
-            free_response=free_response,
-            setpoint=np.broadcast_to(np.asarray(setpoint, dtype=np.float64), free_response.shape),
-            previous_moves=state.plan,
-            past_moves=state.past_moves,
-            recover=True,
-            warm=state.warm,
-            time_limit=self.time_limit,
-            gap=self.gap,
-            finish=self.finish,
-        )
-        return self._after(state, plan)
-
-    def _after(self, state: ControllerState, plan: Plan | None) -> tuple[ControllerState, StepInfo]:
-        good = plan is not None and plan.moves is not None
-        moves = (
-            plan.moves
-            if plan is not None and plan.moves is not None
-            else np.zeros_like(np.asarray(state.plan))
-        )
-        recovering = bool(outside_limits(self.tuning, state.mv))
-        fits = (
-            plan is not None
-            and plan.warm is not None
-            and len(plan.warm.row_price) == len(state.warm.row_price)
-        )
-        warm = plan.warm if plan is not None and fits else state.warm
-        state = _remember(self.memory, state, jnp.asarray(moves[0]), jnp.asarray(moves), warm)
-        number = lambda value: np.float64(np.nan if value is None else value)  # noqa: E731
-        values: dict[str, Any] = dict(  # on the host: NumPy where the compiled controller has JAX arrays
-            move=moves[0],
-            mv=np.asarray(state.mv),
-            moves=moves,
-            status=np.int64(codes.STATUS.index(plan.status) if plan is not None else codes.FAILED),
-            fallback=np.bool_(not good),
-            recovering=np.bool_(recovering),
-            objective=number(plan.objective if plan else None),
-            bound=number(plan.bound if plan else None),
-            gap=number(plan.gap if plan else None),
-            nodes=np.int64(plan.nodes if plan else 0),
-            finished_by=np.int64(codes.finisher_code(plan.finished_by if plan else None)),
-            solve_time=number(plan.solve_time_s if plan else None),
-        )
-        return state, StepInfo(**values)
-
-
-@eqx.filter_jit
-def _observe(memory: _Memory, state: ControllerState, cv):
-    return memory.observe(state, cv)
-
-
-@eqx.filter_jit
-def _remember(memory: _Memory, state: ControllerState, move, moves, warm):
-    return memory.remember(state, move, moves, warm)

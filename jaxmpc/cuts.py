@@ -62,3 +62,14 @@ class Cuts:
             curved = away @ c.root_factor
             best = np.maximum(best, value + away @ gradient + 0.5 * np.einsum("pi,pi->p", curved, curved))
         return best + (c.own_weight * points**2).sum(axis=1)
+
+    def tangent(self, point: Int[np.ndarray, " integer"]):
+        """Value, place and gradient at `point` of the cut of R that is highest there."""
+        c = self.constants
+        best = (-np.inf, point, np.zeros(len(point)))
+        for value, at, gradient in self.list:
+            bent = c.schur @ (point - at)
+            height = value + (point - at) @ (gradient + 0.5 * bent)
+            if height > best[0]:
+                best = (float(height), point, gradient + bent)
+        return best

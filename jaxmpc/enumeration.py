@@ -11,12 +11,11 @@ import numpy as np
 from jaxmpc.cuts import Cuts
 from jaxmpc.levelset import LowerModel, enumerate_below
 from jaxmpc.propagation import satisfied
-from jaxmpc.search import GROUP, Search, Steps
+from jaxmpc.search import Search, Steps
 
 MOST = 20_000  # partial candidates alive at once from which the list is given up
 CELLS = 600_000  # the same in single moves, for long horizons
-PATIENT = 4  # rounds of `GROUP` after which whole batches are solved
-BATCH = 64
+FIRST, MOST_AT_ONCE = 2, 64  # candidates solved in the first round; later ones take twice as many
 
 
 def enumerate_all(
@@ -59,7 +58,7 @@ def enumerate_all(
         if search.out_of_time():
             search.discard(float(bounds.min()))
             return False
-        size = GROUP if rounds < PATIENT else BATCH
+        size = min(FIRST * 2**rounds, MOST_AT_ONCE)
         rank = np.argsort(bounds, kind="stable")
         chosen, rest = rank[:size], rank[size:]
         known = len(cuts.list)

@@ -1,15 +1,17 @@
 """Exact whole moves (thesis 6.1, 6.5, 6.6): relaxation, fixing, enumeration under cuts, HiGHS, branch and bound.
 
-The line of a solve: one tight relaxation bounds the problem and nearly always finds whole moves by itself; otherwise
-the best candidates by its prices and the shifted previous plan are solved in one batch and give an incumbent and
-quadratic cuts; prices fix every move that cannot improve on it; what is left is listed and pruned by cuts, or a reduced
-MILP, or branch and bound over batched relaxations closes the rest. Every path ends with the same certificate:
+The line of a solve: one tight relaxation bounds the problem and nearly always finds whole moves by itself; otherwise its
+moves are rounded and solved, for an incumbent and a quadratic cut; prices fix every move that cannot improve on it;
+what is left is listed and pruned by cuts of the best candidates; where the list is too long, the shifted previous
+plan and the best moves by the prices are tried, and a reduced MILP, or branch and bound over batched relaxations, closes
+the rest. Every path ends with the same certificate:
 incumbent, lower bound, gap. `plan` and the mixed-integer controllers call this for one step or many side by side.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -26,7 +28,7 @@ from jaxmpc.propagation import propagate, satisfied
 from jaxmpc.relaxer import Constants, Relaxations, Relaxer
 from jaxmpc.scheduling import run
 from jaxmpc.search import GROUP, Search, SearchResult, Steps
-from jaxmpc.status import INFEASIBLE
+from jaxmpc.status import INFEASIBLE, OPTIMAL
 from jaxmpc.structure import Structure
 
 BEAM = 64  # partial candidates kept while looking for good first moves
@@ -67,7 +69,7 @@ def solve_integer(
         gap=gap,
         time_limit=time_limit,
         finish=finish,
-    )[0]
+    )[0][0]
 
 
 def solve_integers(
@@ -79,7 +81,7 @@ def solve_integers(
     gap: float = 1e-6,
     time_limit: float | None = None,
     finish: str = "auto",
-) -> list[SearchResult]:
+) -> tuple[list[SearchResult], Relaxations]:
     """Solve the problems of many scenarios side by side; arguments as in `solve_integer`, with a scenario axis.
 
     Args:
@@ -90,25 +92,24 @@ def solve_integers(
         gap: relative gap.
         time_limit: seconds of work per scenario.
         finish: path that has to close the problems.
+
+    Returns:
+        ``(results, roots)``: one result per scenario, and the solved relaxations of all.
     """
-    on_host = jax.tree.map(np.asarray, instances)
-    count = len(on_host.lower)
+    count = len(instances.lower)
     begin, compiled = time.perf_counter(), relaxer.compiling
     root = relaxer.solve_roots(instances, warm)
     seconds = time.perf_counter() - begin - (relaxer.compiling - compiled)
     results: list[SearchResult | None] = [None] * count
     open_searches = []
     for i in range(count):
-        own = root.part(i, i + 1)
-        bound = max(float(own.bound[0]), 0.0)
-        value = float(own.snapped[0])
+        bound, value = max(float(root.bound[i]), 0.0), float(root.snapped[i])
         scale = max(abs(value), 1e-6 * relaxer.scenario(i).scale)
         if finish == "auto" and np.isfinite(value) and value - bound <= max(gap, 1e-9) * scale:
-            results[i] = _closed_by_root(relaxer, own, bound, seconds / count)
+            results[i] = _closed_by_root(relaxer, root, i, bound, seconds / count)
             continue
-        search = Search(
-            relaxer.scenario(i), jax.tree.map(lambda leaf, i=i: leaf[i], on_host), own, gap, time_limit
-        )
+        own = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], instances)
+        search = Search(relaxer.scenario(i), own, root.part(i, i + 1), gap, time_limit)
         search.spent = seconds / count
         open_searches.append((i, search, _line(search, starts[i], finish)))
     if open_searches:
@@ -116,15 +117,17 @@ def solve_integers(
         for (i, search, _), result in zip(open_searches, done, strict=True):
             result.seconds = search.spent
             results[i] = result
-    return [result for result in results if result is not None]
+    return [result for result in results if result is not None], root
 
 
-def _closed_by_root(relaxer: Relaxer, root: Relaxations, bound: float, seconds: float) -> SearchResult:
+def _closed_by_root(
+    relaxer: Relaxer, root: Relaxations, lane: int, bound: float, seconds: float
+) -> SearchResult:
     """The root's own moves are whole: nothing to search."""
-    x = root.x[0].copy()
+    x = root.x[lane].copy()
     x[relaxer.integer] = np.round(x[relaxer.integer])
-    value = float(root.snapped[0])
-    return SearchResult(x, value, min(bound, value), 0, "relaxation", 1, root.start(0), seconds)
+    value = float(root.snapped[lane])
+    return SearchResult(x, value, min(bound, value), OPTIMAL, "relaxation", 1, root.start(lane), seconds)
 
 
 def _line(search: Search, starts: list[np.ndarray], finish: str) -> Steps:
@@ -134,20 +137,21 @@ def _line(search: Search, starts: list[np.ndarray], finish: str) -> Steps:
     low = np.round(search.limits[0][integer]).astype(int)
     high = np.round(search.limits[1][integer]).astype(int)
     infeasible = SearchResult(None, np.inf, np.inf, INFEASIBLE, None, 0)
-    lower, upper, possible = propagate(search.chains, low[None], high[None])
-    if not possible[0] or not continuous_feasible(c.structure, search.instance):
-        return infeasible
-    lower, upper = lower[0], upper[0]
-    search.offer(root, 0)
-    model = search.lower_model(root, 0, low, high)
-    points = _candidates(search, model, starts, lower, upper)
-    if points is None:
-        return infeasible
+    if not (np.isfinite(root.x).all() and np.isfinite(root.bound).all()):
+        return search.finish(None, root_bound)
+    model, lower, upper = search.lower_model(root, 0, low, high), low, high
+    point = np.clip(np.round(model.center), low, high).astype(int)
+    if not satisfied(search.chains, point[None], low, high)[0]:
+        lower, upper, possible = (part[0] for part in propagate(search.chains, low[None], high[None]))
+        point = _repaired(search, model, lower, upper) if possible else None
+        if point is None:
+            return infeasible
     cuts = Cuts(c)
     cuts.add(root, 0, low, high)
-    first = yield from search.evaluate(points)
-    for lane, point in enumerate(points):
-        cuts.add(first, lane, point, point)
+    search.offer(root, 0)
+    yield from _solve_all(search, cuts, [point])
+    if not np.isfinite(search.value) and not continuous_feasible(c.structure, search.instance):
+        return infeasible
     if finish == "auto" and root_bound >= search.cutoff:
         return search.finish("relaxation", root_bound)
     if search.out_of_time():
@@ -166,14 +170,18 @@ def _line(search: Search, starts: list[np.ndarray], finish: str) -> Steps:
                 yield from search.evaluate(last)
             return search.finish("fixing", np.inf)
     if finish in ("auto", "enumeration"):
-        done = yield from enumerate_all(search, model, cuts, lower, upper, limited=finish == "auto")
+        limited = finish == "auto"
+        done = yield from enumerate_all(search, model, cuts, lower, upper, limited=limited)
+        if not done and not search.out_of_time():  # better incumbents make the list shorter
+            yield from _solve_all(search, cuts, _candidates(search, model, starts, lower, upper))
+            done = yield from enumerate_all(search, model, cuts, lower, upper, limited=limited)
         if done or finish == "enumeration" or search.out_of_time():
             return search.finish("enumeration" if done else None, np.inf if done else root_bound)
     if finish in ("auto", "highs"):
         seconds = search.seconds_left()
         if finish == "auto":
             seconds = HIGHS_SECONDS if seconds is None else min(seconds, HIGHS_SECONDS)
-        done, bound = yield from outer_approximation(search, cuts, lower, upper, seconds)
+        done, bound = yield from outer_approximation(search, model, cuts, lower, upper, seconds)
         root_bound = max(root_bound, min(bound, search.value))
         if done or finish == "highs" or search.out_of_time():
             return search.finish("highs" if done else None, root_bound)
@@ -181,27 +189,41 @@ def _line(search: Search, starts: list[np.ndarray], finish: str) -> Steps:
     return search.finish("branch-and-bound", bound)
 
 
+def _solve_all(search: Search, cuts: Cuts, points: Sequence[np.ndarray]) -> Steps:
+    """Solve whole moves that are new, each for an incumbent and a cut."""
+    fresh = search.new(points)
+    if len(fresh):
+        result = yield from search.evaluate(fresh)
+        for lane, point in enumerate(fresh):
+            cuts.add(result, lane, point, point)
+
+
+def _repaired(search: Search, model: LowerModel, lower: np.ndarray, upper: np.ndarray) -> np.ndarray | None:
+    """Where the rounded relaxation breaks a hard row: the best moves by the model, None if there are none at all."""
+    by_model = _best_by_model(search, model, lower, upper)
+    if len(by_model):
+        return by_model[0]
+    for wanted in (model.center, np.zeros(len(lower))):
+        repaired = search.rounded(wanted, lower, upper)
+        if repaired is not None:
+            return repaired
+    return None
+
+
+def _best_by_model(search: Search, model: LowerModel, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Whole moves that satisfy the hard rows, the cheapest by the model first, ``"point integer"``."""
+    found = enumerate_below(model, search.chains, lower, upper, np.inf, None, beam=BEAM)
+    points = np.zeros((0, len(lower)), dtype=int) if found is None else found[0]
+    return points[satisfied(search.chains, points, lower, upper)]
+
+
 def _candidates(
     search: Search, model: LowerModel, starts: list[np.ndarray], lower: np.ndarray, upper: np.ndarray
-) -> np.ndarray | None:
-    """First whole moves to solve, ``"point integer"``: rounded relaxation, starts, the best by the model, zero.
-
-    None if no whole moves satisfy the hard rows at all.
-    """
-    fits = lambda point: bool(satisfied(search.chains, point[None], lower, upper)[0])  # noqa: E731
-    zero = np.zeros(len(lower))
-    center, *others, still = (
-        np.clip(np.round(w), lower, upper).astype(int) for w in (model.center, *starts, zero)
-    )
-    points = [point for point in (center, *others) if fits(point)]
-    by_model = enumerate_below(model, search.chains, lower, upper, np.inf, None, beam=BEAM)
-    if by_model is not None and len(by_model[0]):
-        points += list(by_model[0][satisfied(search.chains, by_model[0], lower, upper)])
-    points = [*points[: GROUP - 1], *([still] if fits(still) else []), *points[GROUP - 1 :]]
-    if not points:
-        repaired = (search.rounded(wanted, lower, upper) for wanted in (model.center, zero))
-        points = [point for point in repaired if point is not None]
-    return search.new(points)[:GROUP] if points else None
+) -> list[np.ndarray]:
+    """Whole moves that may be good: starts, no moves, and the best by the model."""
+    simple = [np.clip(np.round(w), lower, upper).astype(int) for w in (*starts, np.zeros(len(lower)))]
+    fit = [point for point in simple if satisfied(search.chains, point[None], lower, upper)[0]]
+    return (fit + list(_best_by_model(search, model, lower, upper)))[:GROUP]
 
 
 def continuous_feasible(structure: Structure, instance: QpInstance) -> bool:

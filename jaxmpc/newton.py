@@ -1,11 +1,11 @@
-"""A warm start finished exactly: semismooth Newton on the augmented Lagrangian of the relaxed problem.
+"""A start finished exactly: semismooth Newton on the augmented Lagrangian of the relaxed problem.
 
 With the prices of a neighbouring problem (the previous sample, the parent node) most rows are already known to be inside,
 outside or at the edge of their deadzone, and most limits to be active or not. Every row becomes a proximal
 term with its price (Hermans, Themelis and Patrinos 2022, QPALM), whose gradient is piecewise linear, so that a Newton step
-is exact as soon as the classification is right. What is returned is judged by its own duality gap;
-`integer` and the controllers solve with the interior point of `qp` when that is not closed. CV limits that are reached
-are left to the interior point, too.
+is exact as soon as the classification is right, which takes a handful of steps even without a start. What is returned is
+judged by its own duality gap; `relaxation` turns to the interior point of `qp` when that is not closed. CV limits that are
+reached are left to the interior point, too.
 """
 
 from __future__ import annotations
@@ -15,19 +15,14 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxmpc.condense import CondensedQp, QpInstance
-from jaxmpc.relaxed_problem import FIXED, TINY, QpSolution, dual_bound, evaluate, solver_unit, weighted_gram
-from jaxmpc.status import FAILED, OPTIMAL
+from jaxmpc.relaxed_problem import RIDGE, TINY, Prepared, Prices, QpSolution, conclude, solve_positive, total
 
-STEPS = 14  # Newton steps after which a start is given up
+STEPS = 20  # Newton steps after which a start is given up
 PENALTY = 1e4  # curvature of a proximal term against the largest of the Hessian
-CLOSED = 1e-9  # relative duality gap of a finished solve
-FEASIBLE = 1e-8  # hard rows and limits, in scaled moves
-LEAST_SHARE = 1e-7  # of the solver unit: objectives below it have their gap measured against it
-SEARCHES = 6  # secant steps of the line search
+SEARCHES = 12  # trials of the line search
+FLAT = 0.3  # share of its slope at the start that the merit may have where a line search ends
 
 
 class WarmStart(eqx.Module):
@@ -56,176 +51,186 @@ def warm_start_of(solution: QpSolution) -> WarmStart:
     )
 
 
+class _Families(NamedTuple):
+    """One value per deadzone row, limit of x and hard row."""
+
+    row: Array
+    box: Array
+    hard: Array
+
+
 class _State(NamedTuple):
     x: Array
-    row_price: Array
-    box_price: Array
-    hard_price: Array
+    t: Array
+    prices: _Families
+    ridge: Array
     steps: Array
     done: Array
 
 
+class _Proximal(NamedTuple):
+    """The augmented Lagrangian of one lane: new prices of all families, and their slopes.
+
+    A deadzone row with z = sigma t + price has the new price r e + (1 - r) clip(e, -s, s), where e is what z exceeds
+    sigma c by, and r = 2 S / (2 S + sigma).
+    """
+
+    problem: Prepared
+    row_sigma: Array
+    hard_sigma: Array
+    knot: Array
+    share: Array
+
+    def prices(self, x, t, w, old: _Families) -> _Families:
+        """New prices at x."""
+        p, excess = self.problem, self._excess(t, old.row)
+        return _Families(
+            row=self.share * excess + (1.0 - self.share) * jnp.clip(excess, -p.steepness, p.steepness),
+            box=_away(PENALTY * x + old.box, PENALTY * p.lower, PENALTY * p.upper),
+            hard=_away(
+                self.hard_sigma * w + old.hard, self.hard_sigma * p.row_low, self.hard_sigma * p.row_high
+            ),
+        )
+
+    def slopes(self, t, old: _Families, new: _Families) -> _Families:
+        """Derivatives of the new prices in t, x, w."""
+        excess = jnp.abs(self._excess(t, old.row))
+        row = jnp.where(excess <= self.problem.steepness, self.row_sigma, self.row_sigma * self.share)
+        return _Families(
+            row=jnp.where(excess > 0.0, row, 0.0),
+            box=jnp.where(new.box != 0.0, PENALTY, 0.0),
+            hard=jnp.where(new.hard != 0.0, self.hard_sigma, 0.0),
+        )
+
+    def _excess(self, t, price):
+        return _away(self.row_sigma * t + price, -self.knot, self.knot)
+
+    def gradient(self, x, prices: _Families):
+        """Gradient of the augmented Lagrangian, given the new prices at x."""
+        p = self.problem
+        force = p.hessian @ x + p.linear + p.pull(prices.row) + prices.box + prices.hard @ p.w_matrix
+        return p.keep * force
+
+
+def _away(value, low, high):
+    """What a value exceeds its limits by."""
+    return value - jnp.clip(value, low, high)
+
+
 def refine(
-    qp: CondensedQp,
-    rows: Float[Array, "hard n"] | np.ndarray,
-    instance: QpInstance,
-    lower: Float[Array, " n"],
-    upper: Float[Array, " n"],
+    problem: Prepared,
     start: WarmStart,
     *,
     skip: Bool[Array, ""] | None = None,
-) -> QpSolution:
-    """Solve one relaxed problem from a start; arguments and result as `qp.solve`.
+    few: int | Int[Array, ""] = 0,
+    axis: str | None = None,
+) -> tuple[QpSolution, WarmStart, Bool[Array, ""]]:
+    """Solve one lane from a start.
 
-    The status is `OPTIMAL` only if the duality gap is closed and the hard rows hold; otherwise solve anew.
+    Args:
+        problem: the lane.
+        start: where to begin.
+        skip: do not iterate (the lane is solved already, its result is not used).
+        few: number of unfinished lanes at which a whole batch stops.
+        axis: name of the batch axis; None for a single lane.
+
+    Returns:
+        ``(solution, start, ended)``: the solution is judged by `relaxed_problem.conclude`; the start says where to go on,
+        unless there is nothing left to do here.
     """
-    w_matrix = jnp.asarray(rows)
-    offset = instance.offset
-    unit = solver_unit(qp, instance)
-    hessian, linear = qp.hessian / unit, 2.0 * ((qp.quadratic * offset) @ qp.theta) / unit
-    s2, s1, c = 2.0 * qp.soft_quadratic / unit, qp.soft_linear / unit, qp.deadzone
-    soft = (s2 + s1) > 0.0
-    free = (upper - lower) > FIXED
-    keep = free.astype(lower.dtype)
-    takes_part = (jnp.abs(w_matrix) @ keep) > 0.0
-    row_low = jnp.where(takes_part, instance.row_low, -jnp.inf)
-    row_high = jnp.where(takes_part, instance.row_high, jnp.inf)
-    row_sigma = PENALTY / jnp.maximum(jnp.sum(qp.theta**2, axis=1), TINY)
-    hard_sigma = PENALTY / jnp.maximum(jnp.sum(w_matrix**2, axis=1), TINY)
-    gram = weighted_gram(qp)
-
-    def row_prox(t, price):
-        """New price of a deadzone row and its slope in t."""
-        q = t + price / row_sigma
-        beyond = jnp.abs(q) - c
-        edge = beyond <= s1 / row_sigma
-        outside = row_sigma * (s2 * beyond + s1) / (row_sigma + s2)
-        new = jnp.where(beyond <= 0.0, 0.0, jnp.where(edge, row_sigma * beyond, outside)) * jnp.sign(q)
-        slope = jnp.where(beyond <= 0.0, 0.0, jnp.where(edge, row_sigma, s2 * row_sigma / (row_sigma + s2)))
-        return jnp.where(soft, new, 0.0), jnp.where(soft, slope, 0.0)
-
-    def interval_prox(value, price, low, high, sigma):
-        q = value + price / sigma
-        away = jnp.where(q > high, q - high, jnp.where(q < low, q - low, 0.0))
-        return sigma * away, jnp.where(away != 0.0, sigma, 0.0)
-
-    def gradient_of(x, t, w, state):
-        row, row_slope = row_prox(t, state.row_price)
-        box, box_slope = interval_prox(x, state.box_price, lower, upper, PENALTY)
-        hard, hard_slope = interval_prox(w, state.hard_price, row_low, row_high, hard_sigma)
-        gradient = keep * (hessian @ x + linear + row @ qp.theta + box + hard @ w_matrix)
-        return gradient, (row, box, hard), (row_slope, box_slope, hard_slope)
+    p, keep, unit = problem, problem.keep, problem.unit
+    row_sigma = PENALTY / jnp.maximum((p.qp.response**2) @ p.qp.scale**2, TINY)
+    hard_sigma = PENALTY / jnp.maximum(jnp.sum(p.w_matrix**2, axis=1), TINY)
+    proximal = _Proximal(
+        problem=p,
+        row_sigma=row_sigma,
+        hard_sigma=hard_sigma,
+        knot=row_sigma * p.qp.deadzone,
+        share=p.curvature / (p.curvature + row_sigma),
+    )
+    large = 1.0 + jnp.max(jnp.abs(p.linear))
 
     def step(state: _State) -> _State:
-        x = state.x
-        t, w = qp.theta @ x + offset, w_matrix @ x
-        gradient, _, (row_slope, box_slope, hard_slope) = gradient_of(x, t, w, state)
-        matrix = hessian + gram(row_slope) + jnp.diag(box_slope)
-        matrix += w_matrix.T @ (hard_slope[:, None] * w_matrix)
-        matrix = matrix * keep[:, None] * keep[None, :] + jnp.diag(1.0 - keep + 1e-11)
-        dx = -keep * jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix), True), gradient)
-        dt, dw = qp.theta @ dx, w_matrix @ dx
-        along0 = gradient @ dx
-        hdx, hx = hessian @ dx, hessian @ x + linear
+        x, t, w = state.x, state.t, state.x @ p.w_matrix.T
+        prices = proximal.prices(x, t, w, state.prices)
+        slopes = proximal.slopes(t, state.prices, prices)
+        gradient = proximal.gradient(x, prices)
+        matrix = p.newton_matrix(slopes.row, slopes.hard, slopes.box, state.ridge)
+        dx = -keep * solve_positive(matrix, gradient)
+        dt, dw = p.respond(dx), dx @ p.w_matrix.T
+        bend, slope = dx @ (p.hessian @ dx), (p.hessian @ x + p.linear) @ dx
 
         def along(alpha):  # derivative of the merit along dx, increasing in alpha
-            row, _ = row_prox(t + alpha * dt, state.row_price)
-            box, _ = interval_prox(x + alpha * dx, state.box_price, lower, upper, PENALTY)
-            hard, _ = interval_prox(w + alpha * dw, state.hard_price, row_low, row_high, hard_sigma)
-            return (hx + alpha * hdx) @ dx + row @ dt + (keep * box) @ dx + hard @ dw
+            new = proximal.prices(x + alpha * dx, t + alpha * dt, w + alpha * dw, state.prices)
+            forces = total(new.row * dt) + new.box @ dx + new.hard @ dw
+            return slope + alpha * bend + forces
 
-        def secant(_, bracket):
-            low, high, d_low, d_high = bracket
-            alpha = jnp.clip(
-                low - d_low * (high - low) / jnp.where(d_high > d_low, d_high - d_low, 1.0), low, high
-            )
-            alpha = jnp.where(d_high > d_low, alpha, high)
-            value = along(alpha)
-            right = value > 0.0
-            # Illinois rule: the end that stays gets half its slope, so that both ends move
-            return (
-                jnp.where(right, low, alpha),
-                jnp.where(right, alpha, high),
-                jnp.where(right, 0.5 * d_low, value),
-                jnp.where(right, value, 0.5 * d_high),
-            )
-
-        at_one = along(1.0)
-        whole = at_one <= 1e-2 * jnp.abs(along0)
-        searched = jax.lax.fori_loop(0, SEARCHES, secant, (jnp.zeros(()), jnp.ones(()), along0, at_one))
-        alpha = jnp.where(whole, 1.0, jnp.where(searched[0] > 0.0, searched[0], searched[1]))
-        x = x + alpha * dx
-        t, w = t + alpha * dt, w + alpha * dw
-        gradient, (row, box, hard), _ = gradient_of(x, t, w, state)
-        settled = jnp.max(jnp.abs(gradient)) < 1e-7 * (1.0 + jnp.max(jnp.abs(linear)))
-        change = jnp.maximum(
-            jnp.max(jnp.abs(row - state.row_price) / row_sigma * jnp.sqrt(row_sigma)),
-            jnp.max(jnp.abs(box - state.box_price)) / jnp.sqrt(PENALTY),
-        )
-        if w_matrix.shape[0]:
-            change = jnp.maximum(change, jnp.max(jnp.abs(hard - state.hard_price) / jnp.sqrt(hard_sigma)))
-        exact = jnp.max(jnp.abs(gradient)) < 1e-11 * (1.0 + jnp.max(jnp.abs(linear)))
-        pick = lambda new, old: jnp.where(settled, new, old)  # noqa: E731
+        alpha = _search(along, gradient @ dx)
+        x, t, w = x + alpha * dx, t + alpha * dt, w + alpha * dw
+        prices = proximal.prices(x, t, w, state.prices)
+        size = jnp.max(jnp.abs(proximal.gradient(x, prices)))
+        settled, exact = size < 1e-7 * large, size < 1e-12 * large
+        moved = jax.tree.map(lambda new, old: (new - old) ** 2, prices, state.prices)
+        change = total(moved.row / row_sigma) + total(moved.box / PENALTY) + total(moved.hard / hard_sigma)
         good = jnp.all(jnp.isfinite(x))
-        return _State(
-            x=jnp.where(good, x, state.x),
-            row_price=pick(row, state.row_price),
-            box_price=pick(box, state.box_price),
-            hard_price=pick(hard, state.hard_price),
-            steps=jnp.where(good, state.steps + 1, STEPS),
-            done=exact & (change < 1e-9),
+        after = _State(
+            x=x,
+            t=t,
+            prices=jax.tree.map(lambda new, old: jnp.where(settled, new, old), prices, state.prices),
+            ridge=state.ridge,
+            steps=state.steps + 1,
+            done=exact & (change < 1e-17),
         )
+        # a matrix that rounding left indefinite is tried again with more on its diagonal
+        again = state._replace(ridge=1e2 * state.ridge, steps=state.steps + 1)
+        after = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, again)
+        return jax.tree.map(lambda new, old: jnp.where(state.done, old, new), after, state)
 
-    scaled = _State(
-        x=jnp.where(free, jnp.clip(start.x, lower, upper), 0.5 * (lower + upper)),
-        row_price=jnp.where(soft, start.row_price / unit, 0.0),
-        box_price=keep * start.box_price / unit,
-        hard_price=jnp.where(takes_part, start.hard_price / unit, 0.0),
+    def unfinished(state: _State):
+        open_ = ~state.done & (state.steps < STEPS)
+        # one predicate for the whole batch: the loop ends when few lanes are left
+        return open_ if axis is None else jax.lax.psum(open_.astype(jnp.int32), axis) > few
+
+    x = jnp.where(p.free, jnp.clip(start.x, p.lower, p.upper), 0.5 * (p.lower + p.upper))
+    first = _State(
+        x=x,
+        t=p.respond(x) + p.instance.offset,
+        prices=_Families(
+            row=jnp.where(p.soft, start.row_price / unit, 0.0),
+            box=keep * start.box_price / unit,
+            hard=jnp.where(p.takes_part, start.hard_price / unit, 0.0),
+        ),
+        ridge=jnp.asarray(RIDGE),
         steps=jnp.zeros((), dtype=jnp.int32),
         done=jnp.asarray(False) if skip is None else skip,
     )
-    state = jax.lax.while_loop(lambda s: ~s.done & (s.steps < STEPS), step, scaled)
-    x = jnp.clip(state.x, lower, upper)
-    zero = jnp.zeros(instance.limit_high.shape[0])
-    solution = QpSolution(
-        x=x,
-        objective=evaluate(qp, instance, x),
-        bound=jnp.asarray(-jnp.inf),
-        status=jnp.asarray(FAILED),
-        iterations=state.steps,
-        row_price=unit * state.row_price,
-        limit_price=zero,
-        lower_price=unit * jnp.maximum(-state.box_price, 0.0),
-        upper_price=unit * jnp.maximum(state.box_price, 0.0),
-        row_low_price=unit * jnp.maximum(-state.hard_price, 0.0),
-        row_high_price=unit * jnp.maximum(state.hard_price, 0.0),
-        residual=jnp.zeros(()),
-    )
-    none = zero if qp.has_limits else zero[:0]
-    solution = dual_bound(qp, w_matrix, instance, solution, lower, upper, none, none)
-    return certified(qp, w_matrix, instance, solution, lower, upper, CLOSED)
+    state = jax.lax.while_loop(unfinished, step, first)
+    row, box, hard = (unit * value for value in state.prices)
+    x = jnp.clip(state.x, p.lower, p.upper)
+    solution = conclude(p, x, Prices(row, hard), state.steps)
+    return solution, WarmStart(state.x, row, box, hard), state.done | (state.steps >= STEPS)
 
 
-def certified(qp, rows, instance: QpInstance, solution: QpSolution, lower, upper, gap: float) -> QpSolution:
-    """Judge a solution by its own bound and the hard rows; sets status and residual.
+def _search(along, slope):
+    """Step length where the merit is nearly flat: 1, or what the secant method finds between 0 and 1."""
 
-    Args:
-        qp: constant part.
-        rows: hard rows.
-        instance: offsets and limits.
-        solution: with its bound.
-        lower, upper: limits of x.
-        gap: relative duality gap up to which the status is `OPTIMAL`.
-    """
-    least = LEAST_SHARE * solver_unit(qp, instance)
-    found = (solution.objective - solution.bound) / jnp.maximum(jnp.abs(solution.objective), least)
-    takes_part = (jnp.abs(jnp.asarray(rows)) @ (upper - lower > FIXED).astype(lower.dtype)) > 0.0
-    w = jnp.asarray(rows) @ solution.x
-    over = jnp.where(takes_part, jnp.maximum(w - instance.row_high, instance.row_low - w), -jnp.inf)
-    broken = jnp.max(over, initial=0.0)
-    good = (found <= gap) & (broken <= FEASIBLE) & ~jnp.any(lower > upper + FIXED)
-    return eqx.tree_at(
-        lambda s: (s.status, s.residual),
-        solution,
-        (jnp.where(good, OPTIMAL, FAILED), jnp.maximum(found, broken)),
-    )
+    # one vector holds the bracket, so that a batch freezes its finished lanes with one operation
+    def closer(bracket):
+        low, high, at_low, at_high, _, _, tried = bracket
+        alpha = low - at_low * (high - low) / (at_high - at_low)
+        alpha = jnp.where((alpha > low) & (alpha < high), alpha, 0.5 * (low + high))
+        value = along(alpha)
+        # Illinois rule: the end that stays gets half its slope, so that both ends move
+        left = jnp.stack([alpha, high, value, 0.5 * at_high, alpha, value, tried + 1.0])
+        right = jnp.stack([low, alpha, 0.5 * at_low, value, alpha, value, tried + 1.0])
+        return jnp.where(value > 0.0, right, left)
+
+    def steep(bracket):
+        *_, value, tried = bracket
+        # a full step may stop short of the minimum
+        size = jnp.where(tried > 0.0, jnp.abs(value), value)
+        return ~(size <= FLAT * jnp.abs(slope)) & (tried <= SEARCHES)
+
+    at_one = along(1.0)
+    zero, one = jnp.zeros(()), jnp.ones(())
+    return jax.lax.while_loop(steep, closer, jnp.stack([zero, one, slope, at_one, one, at_one, zero]))[4]

@@ -1,9 +1,10 @@
-"""Closing an integer problem with HiGHS: MILPs over cuts of solved problems, the master of `highs`.
+"""Closing an integer problem with HiGHS: MILPs over tangents of quadratic cuts, the master of `highs`.
 
-Part of the curvature of the cuts is separable and goes into the master's binaries exactly: with 0 <= D <= S diagonal on the
-moves still free, R(d) - 1/2 d'D d is convex and is what the linear cuts bound. Every proposal of the master is solved
-together with the neighbours that the cuts leave cheapest, each giving a cut and perhaps an incumbent, until the master
-finds nothing below the incumbent.
+The master is linear, the cuts of solved problems are not: each is given to it by its tangents at the candidates that it
+has to exclude. Part of the curvature is separable and goes into the master's binaries exactly: with 0 <= D <= S
+diagonal on the moves still free, R(d) - 1/2 d'D d is convex and is what the tangents bound. A listed candidate that
+the cuts do not exclude is solved, which adds a cut and perhaps an incumbent; when none is left, the master has to
+agree, and what it still proposes joins the list.
 """
 
 from __future__ import annotations
@@ -13,15 +14,23 @@ import itertools
 import numpy as np
 
 from jaxmpc.cuts import Cuts
+from jaxmpc.levelset import LowerModel, enumerate_below
 from jaxmpc.propagation import satisfied
 from jaxmpc.search import GROUP, Offload, Search, Steps
 
+LISTED = 2_000  # candidates the tangents are chosen by
+BEAM = 256  # partial candidates kept where the list would be longer
+TANGENTS = 64  # added between two master problems at most
 
-def outer_approximation(search: Search, cuts: Cuts, lower, upper, seconds: float | None) -> Steps:
+
+def outer_approximation(
+    search: Search, model: LowerModel, cuts: Cuts, lower, upper, seconds: float | None
+) -> Steps:
     """Close the reduced problem with MILPs over cuts; returns whether it is closed, and the bound reached.
 
     Args:
         search: state of the solve.
+        model: root's lower model.
         cuts: known so far; more are added.
         lower: limits of the integer moves, equal where a move is fixed.
         upper: the same.
@@ -31,25 +40,18 @@ def outer_approximation(search: Search, cuts: Cuts, lower, upper, seconds: float
 
     c = search.constants
     limit = None if seconds is None else search.spent + seconds
-    free = np.flatnonzero(upper > lower)
-    diagonal = np.zeros(len(lower))
-    diagonal[free] = diagonal_share(c.schur[np.ix_(free, free)])
-    width = int((upper - lower).max(initial=0)) + 1
-    values = lower[:, None] + np.arange(width)[None, :]
-    own = (c.own_weight + 0.5 * diagonal)[:, None] * values.astype(float) ** 2
+    tangents = _Tangents(search, cuts, lower, upper)
     unit = search.reference if np.isfinite(search.value) else c.scale
-    master = ReducedMilp(search.chains, lower, upper, own, unit=unit)
-    wide = yield from search.relax(lower[None], upper[None])
-    search.nodes += 1
-    cuts.add(wide, 0, lower, upper)
-    best_bound = max(float(wide.bound[0]), 0.0)
-    if best_bound >= search.cutoff:
-        return True, best_bound
+    master = ReducedMilp(search.chains, lower, upper, tangents.own, unit=unit)
+    best_bound = search.root_bound
+    points = _listed(search, model, lower, upper)
     told = 0
     while True:
-        for cut in cuts.list[told:]:
-            master.add_cut(*_linear_cut(c.schur, cut, diagonal, free, lower))
-        told = len(cuts.list)
+        yield from _solve_candidates(search, cuts, points, limit)
+        tangents.exclude(points, search.cutoff)
+        for tangent in tangents.list[told:]:
+            master.add_cut(*tangent)
+        told = len(tangents.list)
         left = None if limit is None else limit - search.spent
         if left is not None and left <= 0:
             return False, best_bound
@@ -62,14 +64,60 @@ def outer_approximation(search: Search, cuts: Cuts, lower, upper, seconds: float
         if point is None or not finished:
             return False, best_bound
         search.nodes += 1
-        if point.tobytes() in search.seen:
-            master.forbid(point)  # solved before: its value is known, only what is left matters
-            continue
-        neighbourhood = _neighbours(search, cuts, point, lower, upper)
-        result = yield from search.evaluate(neighbourhood)
-        for lane, other in enumerate(neighbourhood):
-            cuts.add(result, lane, other, other)
-        master.forbid(point)
+        if tangents.knows(point):
+            master.forbid(point)  # rounding of the master: its value is known, only what is left matters
+        points = _around(search, point, lower, upper)
+
+
+class _Tangents:
+    """Linear cuts of R less the separable curvature, chosen from the quadratic cuts."""
+
+    def __init__(self, search: Search, cuts: Cuts, lower: np.ndarray, upper: np.ndarray):
+        c = self.constants = search.constants
+        self.cuts, self.lower = cuts, lower
+        self.free = np.flatnonzero(upper > lower)
+        self.diagonal = np.zeros(len(lower))
+        self.diagonal[self.free] = diagonal_share(c.schur[np.ix_(self.free, self.free)])
+        values = lower[:, None] + np.arange(int((upper - lower).max(initial=0)) + 1)[None, :]
+        self.weight = c.own_weight + 0.5 * self.diagonal
+        self.own = self.weight[:, None] * values.astype(float) ** 2
+        self.list: list[tuple[float, np.ndarray, np.ndarray]] = []
+        self.taken: set[bytes] = set()
+
+    def knows(self, point: np.ndarray) -> bool:
+        """Whether a tangent was taken at this point."""
+        return point.tobytes() in self.taken
+
+    def exclude(self, points: np.ndarray, cutoff: float) -> None:
+        """Add tangents until the master's bound of all points that the cuts exclude is at the cutoff."""
+        points = points[self.cuts.bounds(points) >= cutoff]
+        bounds = np.full(len(points), -np.inf)
+        for tangent in self.list:
+            bounds = np.maximum(bounds, self._bound(tangent, points))
+        for _ in range(TANGENTS):
+            if not len(points) or bounds.min() >= cutoff:
+                return
+            point = points[np.argmin(bounds)]
+            if self.knows(point):
+                bounds[np.argmin(bounds)] = np.inf
+                continue
+            self.taken.add(point.tobytes())
+            self.list.append(self._restricted(*self.cuts.tangent(point)))
+            bounds = np.maximum(bounds, self._bound(self.list[-1], points))
+
+    def _bound(self, tangent, points) -> np.ndarray:
+        value, place, slope = tangent
+        return value + (points - place) @ slope + points**2 @ self.weight
+
+    def _restricted(self, value: float, at: np.ndarray, gradient: np.ndarray):
+        """The cut over the free moves, the others being at `lower`, without the separable curvature."""
+        away = self.lower - at
+        away[self.free] = 0.0
+        bent = self.constants.schur @ away
+        value = float(value + gradient @ away + 0.5 * away @ bent)
+        place = at + away
+        level = float(value - 0.5 * self.diagonal @ place**2)
+        return level, place, gradient + bent - self.diagonal * place
 
 
 def diagonal_share(curvature: np.ndarray) -> np.ndarray:
@@ -83,22 +131,35 @@ def diagonal_share(curvature: np.ndarray) -> np.ndarray:
     return max(least - 1e-9, 0.0) * scale**2
 
 
-def _linear_cut(schur, cut, diagonal, free, lower) -> tuple[float, np.ndarray, np.ndarray]:
-    """The cut of R - 1/2 d'D d over the free moves, the others being fixed at `lower`."""
-    value, at, gradient = cut
-    away = lower - at
-    away[free] = 0.0
-    bent = schur @ away
-    value = value + gradient @ away + 0.5 * away @ bent
-    slope = gradient + bent
-    place = at + away
-    return value - 0.5 * diagonal @ place**2, place, slope - diagonal * place
+def _listed(search: Search, model: LowerModel, lower, upper) -> np.ndarray:
+    """Candidates below the incumbent; good ones only where there are too many."""
+    found = enumerate_below(model, search.chains, lower, upper, search.cutoff, LISTED)
+    if found is None:
+        found = enumerate_below(model, search.chains, lower, upper, search.cutoff, None, beam=BEAM)
+    points = np.zeros((0, len(lower)), dtype=int) if found is None else found[0]
+    return points[satisfied(search.chains, points, lower, upper)]
 
 
-def _neighbours(search: Search, cuts: Cuts, point: np.ndarray, lower, upper) -> np.ndarray:
-    """The point and feasible points one or two steps away, those with the least bound, as many as one batch holds."""
+def _solve_candidates(search: Search, cuts: Cuts, points: np.ndarray, limit: float | None) -> Steps:
+    """Solve listed candidates, cheapest first, until the cuts exclude the rest."""
+    while limit is None or search.spent < limit:
+        fresh = np.array([p.tobytes() not in search.seen for p in points], dtype=bool)
+        points = points[fresh]
+        bounds = cuts.bounds(points)
+        points, bounds = points[bounds < search.cutoff], bounds[bounds < search.cutoff]
+        if not len(points):
+            return
+        best = points[np.argsort(bounds, kind="stable")[:GROUP]]
+        result = yield from search.evaluate(best)
+        search.nodes += len(best)
+        for lane, point in enumerate(best):
+            cuts.add(result, lane, point, point)
+
+
+def _around(search: Search, point: np.ndarray, lower, upper) -> np.ndarray:
+    """The point and the feasible points one or two steps away."""
     free = np.flatnonzero(upper > lower)
-    steps = []
+    steps = [np.zeros_like(point)]
     for i in free:
         for step in (-1, 1):
             other = np.zeros_like(point)
@@ -109,11 +170,5 @@ def _neighbours(search: Search, cuts: Cuts, point: np.ndarray, lower, upper) -> 
             other = np.zeros_like(point)
             other[i], other[j] = step, -step
             steps.append(other)
-    array = point + np.array(steps).reshape(len(steps), len(point))
-    keep = satisfied(search.chains, array, lower, upper)
-    keep &= np.array([p.tobytes() not in search.seen for p in array], dtype=bool)
-    array = array[keep]
-    bounds = cuts.bounds(array)
-    best = np.argsort(bounds, kind="stable")
-    best = best[bounds[best] < search.cutoff][: GROUP - 1]
-    return np.concatenate([point[None], array[best]])
+    array = point + np.array(steps)
+    return array[satisfied(search.chains, array, lower, upper)]

@@ -9,24 +9,22 @@ import dataclasses
 import functools
 import time
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxmpc import status as codes
 from jaxmpc.blocking import first_position_rows, moves_per_block, sample_moves
-from jaxmpc.condense import DRIFT, QpInstance, condense, dynamic_matrix, integer_columns, make_instance
+from jaxmpc.condense import DRIFT, QpInstance, dynamic_matrix, make_instance
 from jaxmpc.errors import InputError
-from jaxmpc.integer import FINISHES, continuous_feasible, solve_integers
+from jaxmpc.integer import FINISHES, continuous_feasible
 from jaxmpc.newton import WarmStart
 from jaxmpc.relaxer import Constants, Relaxer
 from jaxmpc.search import SearchResult
-from jaxmpc.step_response import StepResponseModel
-from jaxmpc.structure import Structure
+from jaxmpc.step_response import StepResponseModel, check_match
+from jaxmpc.step_solver import StepSolver, fitting
+from jaxmpc.structure import Structure, check_vector
 from jaxmpc.tuning import Tuning
-
-WIDEST_ENVELOPE = 4  # steps up to which the envelope of the squared integer move is built
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,9 +78,6 @@ def _make_instance(structure, tuning, qp, free_response, setpoint, mv_now, last_
     return jax.tree.map(lambda leaf: leaf[None], instance)
 
 
-_condense = eqx.filter_jit(condense)
-
-
 class Planner:
     """Solves the steps of one controller.
 
@@ -96,27 +91,8 @@ class Planner:
         check_match(structure, model)
         self.structure, self.tuning, self.model = structure, tuning, model
         self.matrix = np.asarray(dynamic_matrix(structure, model.coefficients))
-        self._relaxers: dict[int, Relaxer] = {}
+        self.solver = StepSolver(structure, [tuning], [model])
         self._started = False
-        limits = np.concatenate([np.asarray(tuning.cv_low), np.asarray(tuning.cv_high)])
-        self.has_limits = bool(np.isfinite(limits).any() and (np.asarray(tuning.slack_weight) > 0).any())
-
-    def relaxer(self, envelope: int) -> Relaxer:
-        """Compiled relaxations for integer ranges of so many steps, made when first needed."""
-        if envelope not in self._relaxers:
-            qp = _condense(
-                self.structure,
-                self.tuning,
-                self.model.coefficients,
-                envelope=envelope,
-                has_limits=self.has_limits,
-            )
-            self._relaxers[envelope] = Relaxer([Constants(self.structure, qp)])
-        return self._relaxers[envelope]
-
-    def constants(self, envelope: int) -> Constants:
-        """Constants for integer ranges of so many steps."""
-        return self.relaxer(envelope).scenario(0)
 
     def solve(
         self,
@@ -154,11 +130,11 @@ class Planner:
         free_response, setpoint, mv_now = as_array(free_response), as_array(setpoint), as_array(mv_now)
         past = None if past_moves is None else as_array(past_moves)
 
-        def instance_of(constants: Constants) -> QpInstance:
+        def instances_of(relaxer: Relaxer) -> QpInstance:
             return _make_instance(
                 self.structure,
                 self.tuning,
-                constants.qp,
+                relaxer.scenario(0).qp,
                 free_response,
                 setpoint,
                 mv_now,
@@ -167,48 +143,36 @@ class Planner:
                 recover,
             )
 
-        relaxer = self.relaxer(1)
-        integer = relaxer.integer
         if not self._started:  # compiles; the clock measures solves
-            jax.block_until_ready(instance_of(relaxer.scenario(0)))
+            jax.block_until_ready(instances_of(self.solver.relaxer(1)))
             self._started = True
-        begin = time.perf_counter() - self._compiling()
-        instance = instance_of(relaxer.scenario(0))
-        if len(integer):
-            lower, upper = self._bounded(instance)
-            envelope = int(max(np.abs(lower[:, integer]).max(), np.abs(upper[:, integer]).max()))
-            if envelope > 1:
-                relaxer = self.relaxer(envelope if envelope <= WIDEST_ENVELOPE else 0)
-                instance = instance_of(relaxer.scenario(0))
-            instance = eqx.tree_at(lambda i: (i.lower, i.upper), instance, (lower, upper))
-        constants = relaxer.scenario(0)
-        starts = []
-        if previous_moves is not None and len(integer):
-            scale = np.asarray(constants.qp.scale).reshape(self.structure.mv_count, -1).T
-            wanted = (as_array(previous_moves) / scale).T.reshape(-1)[integer]
-            starts.append(np.clip(np.nan_to_num(wanted), -1e6, 1e6))
-        start = jax.tree.map(lambda leaf: np.asarray(leaf)[None], _fitting(warm, constants))
-        result = (
-            solve_integers(
-                relaxer, instance, starts=[starts], warm=start, gap=gap, time_limit=time_limit, finish=finish
-            )[0]
-            if len(integer)
-            else self._solve_relaxed(relaxer, instance, start, gap)
-        )
-        instance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], instance)
-        return self._plan(constants, instance, result, mv_now, free_response, setpoint, gap, begin)
-
-    def _compiling(self) -> float:
-        """Seconds of compilation so far."""
-        return sum(relaxer.compiling for relaxer in self._relaxers.values())
+        begin = time.perf_counter() - self.solver.compiling
+        start = None if warm is None else jax.tree.map(lambda leaf: np.asarray(leaf)[None], warm)
+        if self.structure.integer_mvs:
+            previous = None if previous_moves is None else as_array(previous_moves)[None]
+            relaxer, instances, results, _ = self.solver.solve(
+                instances_of,
+                previous_moves=previous,
+                warm=start,
+                gap=gap,
+                time_limit=time_limit,
+                finish=finish,
+            )
+            result = results[0]
+        else:
+            relaxer = self.solver.relaxer(1)
+            instances = instances_of(relaxer)
+            result = self._solve_relaxed(relaxer, instances, fitting(start, relaxer, 1), gap)
+        instance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], instances)
+        return self._plan(relaxer.scenario(0), instance, result, mv_now, free_response, setpoint, gap, begin)
 
     def _solve_relaxed(
-        self, relaxer: Relaxer, instance: QpInstance, start: WarmStart, gap: float
+        self, relaxer: Relaxer, instances: QpInstance, start: WarmStart, gap: float
     ) -> SearchResult:
         """The problem without integers: one relaxation."""
-        if not continuous_feasible(self.structure, jax.tree.map(lambda leaf: np.asarray(leaf)[0], instance)):
+        if not continuous_feasible(self.structure, jax.tree.map(lambda leaf: np.asarray(leaf)[0], instances)):
             return SearchResult(None, np.inf, np.inf, codes.INFEASIBLE, None, 0)
-        root = relaxer.solve_roots(instance, start)
+        root = relaxer.solve_roots(instances, start)
         if not np.isfinite(root.x[0]).all():
             return SearchResult(None, np.inf, -np.inf, codes.FAILED, None, 1)
         value = float(root.objective[0])
@@ -217,39 +181,18 @@ class Planner:
         status, by = (codes.OPTIMAL, "relaxation") if closed else (codes.LIMIT, None)
         return SearchResult(root.x[0], value, bound, status, by, 1, root.start(0))
 
-    def _bounded(self, instance: QpInstance) -> tuple[np.ndarray, np.ndarray]:
-        """Finite limits ``"1 n"`` for integer moves that have none: the level set of a rounded plan (see `levelset`)."""
-        lower, upper = np.array(instance.lower), np.array(instance.upper)
-        integer = integer_columns(self.structure)
-        if np.isfinite(lower[:, integer]).all() and np.isfinite(upper[:, integer]).all():
-            return lower, upper
-        relaxer = self.relaxer(0)
-        constants = relaxer.scenario(0)
-        padded = _padded(instance, constants)
-        start = jax.tree.map(lambda leaf: leaf[None], constants.cold)
-        root = relaxer.solve_roots(padded, start)
-        center = root.x[:, integer]
-        whole_low = np.where(np.isfinite(lower[:, integer]), lower[:, integer], -1e6)
-        whole_high = np.where(np.isfinite(upper[:, integer]), upper[:, integer], 1e6)
-        fixed_low, fixed_high = lower.copy(), upper.copy()
-        fixed_low[:, integer] = fixed_high[:, integer] = np.clip(np.round(center), whole_low, whole_high)
-        fixed = eqx.tree_at(lambda i: (i.lower, i.upper), padded, (fixed_low, fixed_high))
-        rounded = relaxer.solve_roots(fixed, start)
-        reach = np.sqrt(2.0 * max(rounded.snapped[0] - root.bound[0], 0.0) * constants.radius) + 1.0
-        if not np.isfinite(reach).all():
-            raise InputError(
-                "tuning.move_low",
-                "infinite",
-                "a finite move or MV limit for every integer MV that has neither weight nor effect",
-            )
-        lower[:, integer] = np.maximum(lower[:, integer], np.ceil(center - reach))
-        upper[:, integer] = np.minimum(upper[:, integer], np.floor(center + reach))
-        return lower, upper
-
     def _plan(
-        self, constants, instance, result: SearchResult, mv_now, free_response, setpoint, gap, begin
+        self,
+        constants: Constants,
+        instance,
+        result: SearchResult,
+        mv_now,
+        free_response,
+        setpoint,
+        gap,
+        begin,
     ) -> Plan:
-        elapsed = lambda: time.perf_counter() - begin - self._compiling()  # noqa: E731
+        elapsed = lambda: time.perf_counter() - begin - self.solver.compiling  # noqa: E731
         if result.x is None:
             name = codes.STATUS[result.status]
             return Plan(name, None, None, None, None, None, None, None, None, result.nodes, elapsed(), None)
@@ -311,20 +254,6 @@ class Planner:
         return float(value), cv, (eps_high, eps_low)
 
 
-def _fitting(warm: WarmStart | None, constants: Constants) -> WarmStart:
-    """The start if it has as many rows as the problem (wider integer ranges have more), else a cold one."""
-    fits = warm is not None and len(warm.row_price) == constants.qp.theta.shape[0]
-    return warm if warm is not None and fits else constants.cold
-
-
-def _padded(instance: QpInstance, constants: Constants) -> QpInstance:
-    """The instance with as many envelope rows as the constants have."""
-    rows, predictions = constants.qp.theta.shape[0], instance.limit_high.shape[-1]
-    offset = np.asarray(instance.offset)[:, :predictions]
-    offset = np.concatenate([offset, np.zeros((1, rows - predictions))], axis=1)
-    return eqx.tree_at(lambda i: i.offset, instance, offset)
-
-
 def _repair(structure: Structure, instance: QpInstance, x: np.ndarray) -> np.ndarray:
     """Take solver tolerance out of the continuous moves: clip moves, then positions, block after block."""
     x = x.copy()
@@ -341,30 +270,6 @@ def _repair(structure: Structure, instance: QpInstance, x: np.ndarray) -> np.nda
                 own[b] = min(max(own[b], low), high) if low <= high else own[b]
                 position += counts[b] * own[b]
     return x
-
-
-def check_match(structure: Structure, model: StepResponseModel) -> None:
-    """Refuse a model whose names or sampling interval differ from the structure's."""
-    for key, ours, theirs in (
-        ("cv", structure.cv_names, model.cv_names),
-        ("mv", structure.mv_names, model.mv_names),
-    ):
-        if ours != theirs:
-            raise InputError(
-                f"model.{key}", list(theirs), f"the structure's names in its order, {list(ours)}"
-            )
-    if abs(structure.dt - model.dt) > 1e-9 * structure.dt:
-        raise InputError("model.dt", model.dt, f"the structure's sampling interval {structure.dt} s")
-
-
-def check_vector(path: str, value, names: tuple[str, ...], unit: str) -> np.ndarray:
-    """A finite vector with one entry per name, or an `InputError`."""
-    array = np.asarray(value, dtype=np.float64)
-    if array.shape != (len(names),) or not np.isfinite(array).all():
-        raise InputError(
-            path, np.asarray(value).tolist(), f"{len(names)} finite numbers [{unit}] for {', '.join(names)}"
-        )
-    return array
 
 
 def solve_plan(

@@ -17,20 +17,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
-from jaxmpc.condense import CondensedQp, QpInstance
-from jaxmpc.relaxed_problem import (
-    FIXED,
-    TINY,
-    QpSolution,
-    dual_bound,
-    evaluate,
-    limit_cost,
-    solver_unit,
-    weighted_gram,
-)
-from jaxmpc.status import FAILED, OPTIMAL
+from jaxmpc.relaxed_problem import RIDGE, TINY, Prepared, Prices, QpSolution, conclude, factorise, substitute
 
 MAX_ITERATIONS = 60
 PATIENCE = 15  # iterations without progress after which a lane gives up
@@ -100,46 +89,29 @@ class _Layout:
 
 
 def solve(
-    qp: CondensedQp,
-    rows: Float[Array, "hard n"] | np.ndarray,
-    instance: QpInstance,
-    lower: Float[Array, " n"],
-    upper: Float[Array, " n"],
-    *,
-    skip: Bool[Array, ""] | None = None,
-    tolerance: float = TOLERANCE,
+    problem: Prepared, *, skip: Bool[Array, ""] | None = None, tolerance: float = TOLERANCE
 ) -> QpSolution:
-    """Solve one relaxed problem (one lane; use `jax.vmap` for a batch).
+    """Solve one lane (use `jax.vmap` for a batch).
 
     Args:
-        qp: constant part.
-        rows: hard rows, `blocking.hard_rows(structure)`.
-        instance: offsets and limits of this sample.
-        lower, upper: limits of x that replace the instance's (a search tightens them); equal limits fix a move.
+        problem: the lane.
         skip: do not iterate (the lane is solved already, its result is not used).
         tolerance: of the scaled residuals and the relative gap.
 
     Returns:
-        `QpSolution`; a lane that did not converge has status `FAILED` and still a valid bound.
+        `QpSolution`, judged by `relaxed_problem.conclude`; its bound is valid whether the lane converged or not.
     """
-    n, cvs, rows_count = lower.shape[0], qp.slack_weight.shape[0], qp.theta.shape[0]
-    predictions = instance.limit_high.shape[0] if qp.has_limits else 0
+    p, qp, instance, lower, upper = problem, problem.qp, problem.instance, problem.lower, problem.upper
+    n, cvs, rows_count = lower.shape[0], qp.slack_weight.shape[0], qp.response.shape[0]
     all_predictions = instance.limit_high.shape[0]
+    predictions = all_predictions if qp.has_limits else 0
     groups = 2 * cvs if qp.has_limits else 0
     horizon = all_predictions // cvs
-    w_matrix = jnp.asarray(rows)
+    w_matrix, unit, keep, free = p.w_matrix, p.unit, p.keep, p.free
     layout = _Layout(rows_count, predictions, groups, n, w_matrix.shape[0])
-    free = (upper - lower) > FIXED
-    keep = free.astype(lower.dtype)
     fixed_value = jnp.where(free, 0.0, 0.5 * (lower + upper))
-    # rows without free moves are constants and leave the solver; feasibility of the whole is checked outside
-    takes_part = (jnp.abs(w_matrix) @ keep) > 0.0
-    offset = instance.offset
-    gradient0 = 2.0 * (qp.quadratic * offset) @ qp.theta
-    unit = solver_unit(qp, instance)
-    hessian, linear = qp.hessian / unit, gradient0 / unit
-    s2, s1, c = 2.0 * qp.soft_quadratic / unit, qp.soft_linear / unit, qp.deadzone
-    soft = (s2 + s1) > 0.0
+    offset, hessian, linear = instance.offset, p.hessian, p.linear
+    s2, s1, c, soft = p.curvature, p.steepness, qp.deadzone, p.soft
     rho = jnp.concatenate([qp.slack_weight, qp.slack_weight])[:groups] / unit
     priced = jnp.repeat(rho > 0.0, horizon)
     high_on = jnp.isfinite(instance.limit_high[:predictions]) & priced[:predictions]
@@ -155,8 +127,8 @@ def solve(
             "relief": relief_on,
             "box_low": free & jnp.isfinite(lower),
             "box_high": free & jnp.isfinite(upper),
-            "row_low": takes_part & jnp.isfinite(instance.row_low),
-            "row_high": takes_part & jnp.isfinite(instance.row_high),
+            "row_low": jnp.isfinite(p.row_low),
+            "row_high": jnp.isfinite(p.row_high),
         }
     )
     count = jnp.maximum(jnp.sum(mask), 1)
@@ -165,8 +137,7 @@ def solve(
     limit_high = finite(instance.limit_high[:predictions], high_on)
     limit_low = finite(instance.limit_low[:predictions], low_on)
     box_low, box_high = finite(lower, on["box_low"]), finite(upper, on["box_high"])
-    row_low, row_high = finite(instance.row_low, on["row_low"]), finite(instance.row_high, on["row_high"])
-    gram = weighted_gram(qp)
+    row_low, row_high = finite(p.row_low, on["row_low"]), finite(p.row_high, on["row_high"])
 
     def per_prediction(values):  # one value per CV and side, spread over the horizon: high sides, low sides
         wide = jnp.repeat(values, horizon) if groups else values
@@ -179,20 +150,15 @@ def solve(
         return jnp.concatenate([values, jnp.zeros(rows_count - predictions)])
 
     def dual_residual(x, price):
-        p = layout.split(price)
-        net = p["above"] - p["below"] + on_rows(p["high"] - p["low"])
-        value = hessian @ x + linear + net @ qp.theta + p["box_high"] - p["box_low"]
-        return keep * (value + (p["row_high"] - p["row_low"]) @ w_matrix)
-
-    def worth_of(x, t):  # objective in the solver's units
-        beyond = jnp.maximum(jnp.abs(t) - c, 0.0)
-        rows_cost = jnp.sum(qp.quadratic * t**2) / unit + jnp.sum((0.5 * s2 * beyond + s1) * beyond)
-        return rows_cost + jnp.sum(qp.move_weight * x**2) / unit + jnp.sum(limit_cost(qp, instance, t)) / unit
+        f = layout.split(price)
+        net = f["above"] - f["below"] + on_rows(f["high"] - f["low"])
+        value = hessian @ x + linear + p.pull(net) + f["box_high"] - f["box_low"]
+        return keep * (value + (f["row_high"] - f["row_low"]) @ w_matrix)
 
     # ---- start: slack rows exactly feasible, prices of eta and eps exactly dual feasible
     x = jnp.where(free, 0.5 * (jnp.clip(lower, -10.0, 10.0) + jnp.clip(upper, -10.0, 10.0)), fixed_value)
-    t = qp.theta @ x + offset
-    reach = jnp.sqrt(jnp.sum(qp.theta**2, axis=1)) + 1e-12
+    t = p.respond(x) + offset
+    reach = jnp.sqrt((qp.response**2) @ qp.scale**2) + 1e-12
     eta = jnp.maximum(jnp.abs(t) - c, 0.0) + reach
     inner = jnp.stack([eta + c - t, eta + c + t, eta])
     share = (s2 * eta + s1) / jnp.sum(1.0 / inner, axis=0)
@@ -216,7 +182,7 @@ def solve(
         "low": share_low / safe["low"],
         "relief": share / safe["relief"],
     }
-    wx = w_matrix @ x
+    wx = x @ w_matrix.T
     room = {
         "box_low": x - box_low,
         "box_high": box_high - x,
@@ -259,18 +225,17 @@ def solve(
         skew = (w["above"] - w["below"]) / eta_pivot
         row_weight = (w["above"] + w["below"]) * (s2 + w["beyond"]) + 4.0 * w["above"] * w["below"]
         row_weight = row_weight / eta_pivot + on_rows(w["high"] + w["low"])
-        matrix = hessian + gram(row_weight)
-        matrix += w_matrix.T @ ((w["row_low"] + w["row_high"])[:, None] * w_matrix)
-        matrix += jnp.diag(w["box_low"] + w["box_high"])
+        matrix = p.newton_matrix(
+            row_weight, w["row_low"] + w["row_high"], w["box_low"] + w["box_high"], RIDGE
+        )
         if groups:  # eps eliminated last: a border of two columns per CV
             eps_pivot = jnp.where(relief_on, per_group(w["high"], w["low"]) + w["relief"], 1.0)
             signed = jnp.concatenate([w["high"], -w["low"]]).reshape(2, cvs, horizon)
-            by_cv = qp.theta[:predictions].reshape(cvs, horizon, n)
-            cross = jnp.einsum("scj,cjn->scn", signed, by_cv).reshape(groups, n)
+            by_cv = qp.response[:predictions].reshape(cvs, horizon, n)
+            cross = jnp.einsum("scj,cjn->scn", signed, by_cv).reshape(groups, n) * qp.scale * keep
             matrix -= cross.T @ (cross / eps_pivot[:, None])
-        matrix = matrix * keep[:, None] * keep[None, :] + jnp.diag(1.0 - keep + 1e-11)
         jacobi = 1.0 / jnp.sqrt(jnp.maximum(jnp.diagonal(matrix), TINY))
-        factor = jnp.linalg.cholesky(matrix * jacobi[:, None] * jacobi[None, :] + 1e-14 * jnp.eye(n))
+        factor = factorise(matrix * jacobi[:, None] * jacobi[None, :] + 1e-14 * jnp.eye(n))
         eta_residual = finite(
             s2 * state.eta + s1 - prices["above"] - prices["below"] - prices["beyond"], soft
         )
@@ -283,17 +248,17 @@ def solve(
             eta_push = push["above"] + push["below"] + push["beyond"] - eta_residual
             row_push = push["above"] - push["below"] - skew * eta_push + on_rows(push["high"] - push["low"])
             shifted = layout.split(push_vector - weight * state.primal)
-            rhs = -state.dual - row_push @ qp.theta - shifted["box_high"] + shifted["box_low"]
+            rhs = -state.dual - p.pull(row_push) - shifted["box_high"] + shifted["box_low"]
             rhs -= (shifted["row_high"] - shifted["row_low"]) @ w_matrix
             if groups:
                 eps_push = per_group(push["high"], push["low"]) + push["relief"] - eps_residual
                 rhs += (eps_push / eps_pivot) @ cross
-            dx = keep * jacobi * jax.scipy.linalg.cho_solve((factor, True), jacobi * keep * rhs)
-            dt = qp.theta @ dx
+            dx = keep * jacobi * substitute(factor, jacobi * keep * rhs)
+            dt = p.respond(dx)
             deta = finite(eta_push / eta_pivot + skew * dt, soft)
             deps = finite((eps_push + cross @ dx) / eps_pivot, relief_on) if groups else state.eps
             deps_high, deps_low = per_prediction(deps)
-            dwx = w_matrix @ dx
+            dwx = dx @ w_matrix.T
             dslack = layout.join(
                 {
                     "above": deta - dt,
@@ -330,7 +295,7 @@ def solve(
         primal, dual = (1.0 - alpha) * state.primal, dual_residual(x, price)
         # what the bound can lose: complementarity, and the dual residual over boxes about two units wide
         lost = jnp.sum(slack * price) + 2.0 * jnp.sum(jnp.abs(dual))
-        gap = lost / jnp.maximum(worth_of(x, t), LEAST_WORTH)
+        gap = lost / jnp.maximum(p.value(x, t) / unit, LEAST_WORTH)
         worst = jnp.maximum(jnp.maximum(jnp.max(jnp.abs(dual)), jnp.max(jnp.abs(primal))), gap)
         # progress is judged in absolute terms: the relative gap may grow while the objective falls
         merit = lost + jnp.max(jnp.abs(primal))
@@ -363,20 +328,10 @@ def solve(
     # rounding can undo the last iterations of a degenerate problem: the best one is returned
     x = jnp.where(free, jnp.clip(state.best_x, lower, upper), fixed_value)
     price = layout.split(unit * state.best_price)
-    solution = QpSolution(
-        x=x,
-        objective=evaluate(qp, instance, x),
-        bound=jnp.asarray(-jnp.inf),
-        status=jnp.where(
-            (state.best_residual <= ACCEPTABLE) & ~jnp.any(lower > upper + FIXED), OPTIMAL, FAILED
-        ),
-        iterations=state.iterations,
-        row_price=price["above"] - price["below"],
-        limit_price=jnp.zeros(all_predictions),
-        lower_price=price["box_low"],
-        upper_price=price["box_high"],
-        row_low_price=price["row_low"],
-        row_high_price=price["row_high"],
-        residual=state.best_residual,
+    prices = Prices(
+        row=price["above"] - price["below"],
+        hard=price["row_high"] - price["row_low"],
+        high=price["high"],
+        low=price["low"],
     )
-    return dual_bound(qp, w_matrix, instance, solution, lower, upper, price["high"], price["low"])
+    return conclude(p, x, prices, state.iterations)

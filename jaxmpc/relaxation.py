@@ -1,26 +1,31 @@
-"""A relaxed problem, solved to the end: warm Newton, interior point, Newton again where that fell short.
+"""A relaxed problem, solved to the end: Newton, and where that falls short the interior point and Newton again.
 
-This is what controllers and the integer search call; `qp` and `newton` are its two methods. A lane that one method has
-solved does not iterate in the next, so a batch pays for a method only while some lane needs it.
+This is what controllers and the integer search call; `qp` and `newton` are its two methods. Under `jax.vmap` a batch is
+not solved in lockstep: all lanes take Newton steps together until few are left, and these are
+gathered into small groups, so that finished lanes do not pay for hard ones.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from jaxmpc.condense import CondensedQp, QpInstance
-from jaxmpc.newton import WarmStart, certified, refine, warm_start_of
+from jaxmpc.condense import PACKED_LIMIT, CondensedQp, QpInstance, packed_products
+from jaxmpc.newton import WarmStart, refine, warm_start_of
 from jaxmpc.qp import solve
-from jaxmpc.relaxed_problem import QpSolution
-from jaxmpc.status import FAILED, OPTIMAL
+from jaxmpc.relaxed_problem import QpSolution, prepare
+from jaxmpc.status import OPTIMAL
 
 ROUGH = 1e-9  # relative gap at which the interior point stops
-ENOUGH = 5e-9  # relative gap up to which its result needs no Newton finish
-ACCEPTED = 1e-6  # relative gap up to which the better of all results counts as solved
+ENOUGH = 1e-7  # residual from which on a solution is not improved
+WIDTH = 16  # lanes of a batch that go in lockstep
+LEFT = 4  # they stop when one in so many is unfinished, and leave the room to others
+AXIS = "relaxed lane"
 
 
 def solve_relaxed(
@@ -34,7 +39,7 @@ def solve_relaxed(
     """Solve one relaxed problem (one lane; use `jax.vmap` for a batch).
 
     Args:
-        qp: constant part.
+        qp: constant part; a batch that shares its `response` is fastest.
         rows: hard rows, `blocking.hard_rows(structure)`.
         instance: offsets and limits of this sample.
         lower, upper: limits of x; equal limits fix a move.
@@ -44,46 +49,164 @@ def solve_relaxed(
         `QpSolution` with status `OPTIMAL` if its duality gap is at most 1e-6 and the hard rows hold to 1e-8 [scaled moves],
         else `FAILED`; `iterations` counts both methods, `residual` is the larger of gap and violation.
     """
-    judge = lambda s, gap: certified(qp, rows, instance, s, lower, upper, gap)  # noqa: E731
+    start = cold_start(qp, len(rows)) if start is None else start
+    return _solve((qp, jnp.asarray(rows), instance, lower, upper), start)
+
+
+@jax.custom_batching.custom_vmap
+def _solve(given, start: WarmStart) -> QpSolution:
+    return _solve_lane(given, start, None)
+
+
+@_solve.def_vmap
+def _(size: int, batched, given, start):
+    given, own = _with_products(size, given, batched[0])
+    result = _solve_batch(size, given, own, start, batched[1])
+    return result, jax.tree.map(lambda _: True, result)
+
+
+def _with_products(size: int, given, own):
+    """The same problems with packed products where lanes share the responses; and what has a batch axis."""
+    qp, shared = given[0], not own[0].response
+    if size <= WIDTH or qp.packed is not None or not shared or qp.response.shape[-1] > PACKED_LIMIT:
+        return given, own
+    put = lambda tree, packed: eqx.tree_at(lambda q: q.packed, tree, packed, is_leaf=lambda v: v is None)  # noqa: E731
+    return (put(qp, packed_products(qp.response)), *given[1:]), (put(own[0], False), *own[1:])
+
+
+def _solve_lane(given, start: WarmStart, axis: str | None) -> QpSolution:
+    """One lane from its start to the end; with an axis name, as one of a few lanes that go in lockstep."""
+    problem = prepare(*given)
+    somewhere = lambda flag: flag if axis is None else jax.lax.psum(flag.astype(jnp.int32), axis) > 0  # noqa: E731
 
     def attempt(carry):
         round_, best, start = carry
-        known = best.status == OPTIMAL
-        newton = refine(qp, rows, instance, lower, upper, start, skip=known)
-        best = _choose(known | ~(newton.residual < best.residual), best, newton)
-        # the interior point follows a first attempt only; a second one starts from its result
-        skip = (best.status == OPTIMAL) | (round_ > 0)
-        cold = judge(solve(qp, rows, instance, lower, upper, skip=skip, tolerance=ROUGH), ENOUGH)
-        best = _choose(skip | ~(cold.residual < best.residual), best, cold)
-        return round_ + 1, best, warm_start_of(best)
 
-    first = start if start is not None else cold_start(qp, len(rows))
-    shape = jax.eval_shape(lambda: refine(qp, rows, instance, lower, upper, first))
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
-    nothing = eqx.tree_at(
-        lambda s: (s.status, s.residual, s.bound, s.objective),
-        nothing,
-        (
-            jnp.full_like(nothing.status, FAILED),
-            *(jnp.full_like(nothing.bound, v) for v in (np.inf, -np.inf, np.inf)),
-        ),
-    )
+        def rescue(best):
+            other = solve(problem, skip=~_unsolved(best), tolerance=ROUGH)
+            best = _better(best, other)
+            return best, warm_start_of(best)
+
+        # the interior point has a try only where Newton fell short; Newton then finishes its result
+        best, start = jax.lax.cond(round_ > 0, rescue, lambda best: (best, start), best)
+        other, start, _ = refine(problem, start, skip=~_unsolved(best), axis=axis)
+        return round_ + 1, _better(best, other), start
+
+    carry = jnp.zeros((), dtype=jnp.int32), _nothing(*given[:3]), start
     _, best, _ = jax.lax.while_loop(
-        lambda carry: (carry[0] < 2) & (carry[1].status != OPTIMAL),
-        attempt,
-        (jnp.zeros((), dtype=jnp.int32), nothing, first),
+        lambda carry: (carry[0] < 2) & somewhere(_unsolved(carry[1])), attempt, carry
     )
-    return judge(best, ACCEPTED)
+    return best
 
 
-def _choose(first_is_taken, first: QpSolution, second: QpSolution) -> QpSolution:
-    picked = jax.tree.map(lambda a, b: jnp.where(first_is_taken, a, b), first, second)
-    return eqx.tree_at(lambda s: s.iterations, picked, first.iterations + second.iterations)
+def _unsolved(best: QpSolution) -> Bool[Array, ""]:
+    return ~((best.status == OPTIMAL) & (best.residual <= ENOUGH))
+
+
+def _nothing(qp: CondensedQp, rows, instance: QpInstance) -> QpSolution:
+    """A solution that any other is better than."""
+    hard, n, count = rows.shape[-2], qp.response.shape[-1], qp.response.shape[-2]
+    infinite, zero = jnp.asarray(jnp.inf), jnp.zeros((), dtype=jnp.int32)
+    return QpSolution(
+        x=jnp.zeros(n),
+        objective=infinite,
+        bound=-infinite,
+        status=zero - 1,
+        iterations=zero,
+        row_price=jnp.zeros(count),
+        limit_price=jnp.zeros(instance.limit_high.shape[-1]),
+        lower_price=jnp.zeros(n),
+        upper_price=jnp.zeros(n),
+        row_low_price=jnp.zeros(hard),
+        row_high_price=jnp.zeros(hard),
+        residual=infinite,
+    )
+
+
+def _better(best: QpSolution, other: QpSolution) -> QpSolution:
+    picked = jax.tree.map(lambda a, b: jnp.where(other.residual < best.residual, b, a), best, other)
+    return eqx.tree_at(lambda s: s.iterations, picked, best.iterations + other.iterations)
+
+
+NEWTON, RESCUE, RETRY, DONE = range(4)  # what a lane of a batch waits for
+
+
+class _Progress(NamedTuple):
+    """A batch on its way: results so far, where lanes go on, what they wait for, and whose turn it is."""
+
+    result: QpSolution
+    start: WarmStart
+    stage: Array
+    turn: Array
+
+
+def _solve_batch(size: int, given, own, start: WarmStart, own_start) -> QpSolution:
+    """Many lanes; `own` and `own_start` are True for arrays with a batch axis."""
+    if size <= WIDTH:
+        to_the_end = lambda given, start: _solve_lane(given, start, AXIS)  # noqa: E731
+        return _lanes(to_the_end, (given, start), (own, own_start))
+    start = jax.tree.map(
+        lambda v, mine: v if mine else jnp.broadcast_to(v, (size, *v.shape)), start, own_start
+    )
+    mine = own, jax.tree.map(lambda _: True, start)
+
+    def newton(few, picked, stage, skip):
+        some_steps = lambda given, start, skip: refine(prepare(*given), start, skip=skip, few=few, axis=AXIS)  # noqa: E731
+        solution, resume, ended = _lanes(some_steps, (*picked, skip), (*mine, True))
+        return solution, resume, jnp.where(ended, jnp.where(stage == NEWTON, RESCUE, DONE), stage)
+
+    def rescue(_, picked, stage, skip):
+        def interior(given, start, skip):
+            solution = solve(prepare(*given), skip=skip, tolerance=ROUGH)
+            return solution, warm_start_of(solution)
+
+        return *_lanes(interior, (*picked, skip), (*mine, True)), jnp.full_like(stage, RETRY)
+
+    def visit(progress: _Progress) -> _Progress:
+        """Some lanes get on: those whose turn it is, Newton's first."""
+        ready = (progress.stage == NEWTON) | (progress.stage == RETRY)
+        stepping = jnp.any(ready)
+        waiting = jnp.where(stepping, ready, progress.stage == RESCUE)
+        crowd = jnp.sum(waiting)
+        order = (jnp.arange(size) + progress.turn) % size
+        lanes = order[jnp.nonzero(waiting[order], size=WIDTH, fill_value=0)[0]]
+        skip = jnp.arange(WIDTH) >= crowd
+        few = jnp.where(crowd > WIDTH, WIDTH // LEFT, 0)
+        picked = jax.tree.map(lambda v, own: v[lanes] if own else v, (given, progress.start), mine)
+        solution, resume, stage = jax.lax.cond(
+            stepping, newton, rescue, few, picked, progress.stage[lanes], skip
+        )
+        steps = progress.result.iterations[lanes] + solution.iterations
+        stage = jnp.where(jax.vmap(_unsolved)(solution), stage, DONE)
+        # rows that must not be written are sent out of range
+        write = lambda rows: lambda old, new: old.at[rows].set(new, mode="drop")  # noqa: E731
+        here = jnp.where(skip, size, lanes)
+        improved = solution.residual < progress.result.residual[lanes]
+        result = jax.tree.map(write(jnp.where(improved, here, size)), progress.result, solution)
+        result = eqx.tree_at(lambda s: s.iterations, result, write(here)(result.iterations, steps))
+        return _Progress(
+            result=result,
+            start=jax.tree.map(write(here), progress.start, resume),
+            stage=write(here)(progress.stage, stage),
+            turn=(lanes[-1] + 1) % size,
+        )
+
+    nothing = jax.tree.map(lambda v: jnp.broadcast_to(v, (size, *v.shape)), _nothing(*given[:3]))
+    first = _Progress(nothing, start, jnp.full(size, NEWTON), jnp.zeros((), dtype=int))
+    return jax.lax.while_loop(lambda progress: jnp.any(progress.stage != DONE), visit, first).result
+
+
+def _lanes(function, arguments, own):
+    """The function under `jax.vmap`, over the arrays of its arguments that have a batch axis."""
+    leaves, form = jax.tree.flatten(arguments)
+    axes = tuple(0 if mine else None for mine in jax.tree.leaves(own))
+    call = lambda *leaves: function(*jax.tree.unflatten(form, leaves))  # noqa: E731
+    return jax.vmap(call, in_axes=axes, axis_name=AXIS)(*leaves)
 
 
 def cold_start(qp: CondensedQp, hard: int) -> WarmStart:
     """A start that knows nothing: no moves, no prices."""
-    n, rows = qp.theta.shape[1], qp.theta.shape[0]
+    rows, n = qp.response.shape
     return WarmStart(jnp.zeros(n), jnp.zeros(rows), jnp.zeros(n), jnp.zeros(hard))
 
 

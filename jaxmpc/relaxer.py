@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmpc.batch import lanes_of
 from jaxmpc.blocking import hard_rows
 from jaxmpc.condense import CondensedQp, QpInstance, integer_columns
 from jaxmpc.levelset import assignment_order, leading_factor, root_factor, schur_complement
@@ -122,23 +123,10 @@ class Relaxer:
         self.constants = constants
         first = constants[0]
         self.structure, self.rows, self.integer = first.structure, first.rows, first.integer
-        qps = [c.qp for c in constants]
-        leaves = [jax.tree.leaves(qp) for qp in qps]
-        same = [
-            all(other[i] is leaf or np.array_equal(other[i], leaf) for other in leaves[1:])
-            for i, leaf in enumerate(leaves[0])
-        ]
-        definition = jax.tree.structure(qps[0])
-        none = [None] * len(same)
-        self.shared = jax.tree.unflatten(
-            definition, [leaf if is_same else None for leaf, is_same in zip(leaves[0], same, strict=True)]
+        self.lanes = lanes_of([c.qp for c in constants])
+        self.lean = eqx.tree_at(
+            lambda q: q.packed, self.lanes.shared, None, is_leaf=lambda leaf: leaf is None
         )
-        stacked = [
-            none[i] if is_same else np.stack([np.asarray(lane[i]) for lane in leaves])
-            for i, is_same in enumerate(same)
-        ]
-        self.own = jax.tree.unflatten(definition, stacked)
-        self.lean = eqx.tree_at(lambda q: q.packed, self.shared, None, is_leaf=lambda leaf: leaf is None)
         self.hard, self.columns = jnp.asarray(self.rows), jnp.asarray(self.integer)
         self.one = len(constants) == 1
         self.compiling = 0.0  # seconds of first calls so far
@@ -187,8 +175,8 @@ class Relaxer:
 
     def _call(self, instances, index, lower, upper, starts):
         """Call the relaxation; a first call compiles, which is not held against a time limit."""
-        shared = self.lean if len(index) <= LEAN else self.shared
-        arguments = (shared, self.own, self.hard, self.columns, instances, index, lower, upper, starts)
+        shared = self.lean if len(index) <= LEAN else self.lanes.shared
+        arguments = (shared, self.lanes.each, self.hard, self.columns, instances, index, lower, upper, starts)
         form = jax.tree.structure(arguments), tuple(np.shape(leaf) for leaf in jax.tree.leaves(arguments))
         if form not in _COMPILED:
             begin = time.perf_counter()

@@ -7,7 +7,7 @@ search is a generator: it yields what it needs solved and is sent the results, s
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from typing import Any
 
 import jax
@@ -177,7 +177,7 @@ class Search:
         point = nearest(self.chains, moves, lower, upper)
         return point if point is not None and satisfied(self.chains, point[None], lower, upper)[0] else None
 
-    def new(self, points: list[np.ndarray | None]) -> np.ndarray:
+    def new(self, points: Sequence[np.ndarray | None]) -> np.ndarray:
         """The points that have not been evaluated yet, each once, ``"point integer"``."""
         fresh = {p.tobytes(): p for p in points if p is not None and p.tobytes() not in self.seen}
         return np.array(list(fresh.values())).reshape(len(fresh), len(self.constants.integer))

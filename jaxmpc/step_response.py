@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
+from jaxmpc.structure import Structure
 
 FORMAT = "jaxmpc/step-response/1"
 
@@ -174,3 +175,17 @@ def advance_free_response(
 def shift_free_response(free: Float[Array, "cv horizon"]) -> Float[Array, "cv horizon"]:
     """The free response seen from the next sample; the last value is repeated, S(N+1) = S(N)."""
     return jnp.concatenate([free[:, 1:], free[:, -1:]], axis=1)
+
+
+def check_match(structure: Structure, model: StepResponseModel) -> None:
+    """Refuse a model whose names or sampling interval differ from the structure's."""
+    for key, ours, theirs in (
+        ("cv", structure.cv_names, model.cv_names),
+        ("mv", structure.mv_names, model.mv_names),
+    ):
+        if ours != theirs:
+            raise InputError(
+                f"model.{key}", list(theirs), f"the structure's names in its order, {list(ours)}"
+            )
+    if abs(structure.dt - model.dt) > 1e-9 * structure.dt:
+        raise InputError("model.dt", model.dt, f"the structure's sampling interval {structure.dt} s")

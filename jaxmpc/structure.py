@@ -122,3 +122,13 @@ class Structure:
     def relaxed(self) -> Structure:
         """The same structure with every MV continuous."""
         return dataclasses.replace(self, integer_step=())
+
+
+def check_vector(path: str, value, names: tuple[str, ...], unit: str) -> np.ndarray:
+    """A finite vector with one entry per name, or an `InputError`."""
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape != (len(names),) or not np.isfinite(array).all():
+        raise InputError(
+            path, np.asarray(value).tolist(), f"{len(names)} finite numbers [{unit}] for {', '.join(names)}"
+        )
+    return array

@@ -1,6 +1,7 @@
 """What a closed loop leaves behind: one `Trajectory` per run, plain arrays with the time axis first.
 
-`jaxmpc.closed_loop.simulate` makes it; stores, key figures and plots read it. Sample k is the interval from
+`jaxmpc.closed_loop.simulate` makes it; stores, key figures and plots read it. `TrajectoryBatch` holds many runs of one
+structure, with the lane axis before the time axis, and of each only what was asked for. Sample k is the interval from
 `time[k]` to `time[k + 1]`: `cv[k]` is measured at its start, `mv_demand[k]` is decided from that measurement
 and held until its end.
 """
@@ -8,6 +9,7 @@ and held until its end.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -93,3 +95,60 @@ AXES = {
     "cv": ("setpoint", "cv", "bias", "bias_raw"),
     "mv": ("mv_demand", "mv", "move"),
 }
+
+
+RECORDABLE = tuple(key for keys in AXES.values() for key in keys if key not in ("time", "setpoint"))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TrajectoryBatch:
+    """Some closed-loop runs of one structure; `batch["cv"]` is an array ``"lane sample cv"``.
+
+    Attributes:
+        lanes: ``"lane"``, which lanes of the whole sweep these are.
+        time: ``"sample"``, start of each sample [s].
+        setpoint: ``"lane sample cv"`` [CV unit].
+        fields: the recorded fields of `Trajectory` by name, each with a lane axis first.
+        cv_names, mv_names, cv_units, mv_units: names and units in the order of the arrays.
+        dt: sampling interval [s].
+    """
+
+    lanes: np.ndarray
+    time: np.ndarray
+    setpoint: np.ndarray
+    fields: Mapping[str, np.ndarray]
+    cv_names: tuple[str, ...]
+    mv_names: tuple[str, ...]
+    cv_units: tuple[str, ...]
+    mv_units: tuple[str, ...]
+    dt: float
+
+    def __len__(self) -> int:
+        return len(self.lanes)
+
+    def __getitem__(self, field: str) -> np.ndarray:
+        if field not in self.fields:
+            recorded = ", ".join(self.fields) or "nothing"
+            raise InputError("record", field, f"a recorded field; recorded were: {recorded}")
+        return self.fields[field]
+
+    def trajectory(self, k: int) -> Trajectory:
+        """The k-th of these runs; needs every field.
+
+        Raises:
+            InputError: naming a field that was not recorded.
+        """
+        return Trajectory(
+            time=self.time,
+            setpoint=self.setpoint[k],
+            **{field: self[field][k] for field in RECORDABLE},
+            cv_names=self.cv_names,
+            mv_names=self.mv_names,
+            cv_units=self.cv_units,
+            mv_units=self.mv_units,
+            dt=self.dt,
+        )
+
+    def trajectories(self) -> Iterator[Trajectory]:
+        """All runs, one after the other."""
+        return (self.trajectory(k) for k in range(len(self)))

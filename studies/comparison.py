@@ -20,8 +20,9 @@ import xarray as xr
 from tqdm import tqdm
 
 from jaxmpc.closed_loop import simulate
-from jaxmpc.controller import ContinuousController, MixedIntegerController
+from jaxmpc.controller import ContinuousController
 from jaxmpc.errors import InputError
+from jaxmpc.mixed_integer import MixedIntegerController
 from jaxmpc.step_response import StepResponseModel
 from jaxmpc.trajectory import Trajectory
 from studies.definition import ComparisonDefinition, ControllerDefinition

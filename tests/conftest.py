@@ -1,5 +1,6 @@
 """Shared fixtures. Importing the package switches JAX to float64 and turns on the compilation cache."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -7,6 +8,13 @@ import jaxmpc  # noqa: F401
 from jaxmpc.step_response import make_model
 from jaxmpc.structure import Structure
 from jaxmpc.tuning import make_tuning
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _forget_compiled_programs():
+    """Every compiled program holds hundreds of memory maps, and a process may have 65,530 of them."""
+    yield
+    jax.clear_caches()
 
 
 def second_order(gain, slow, fast, zero, samples, dt=10.0):

@@ -1,9 +1,10 @@
 """Independent answers to one controller step, written straight from the equations (thesis 5.1-5.2, 6.1-6.5).
 
-Nothing here is shared with the library: a case is read as the plain content of its JSON file, predictions
-are superposed sample by sample, and the optimisation problem is the *full* form (5.6) with every sample's
-move, MV and CV as a variable. `objective` and `violation` judge a given plan; `solve_qp`, `solve_scip` and
-`brute_force` find plans with other people's solvers. What they are good for stands beside the functions.
+Nothing here is shared with the solvers of the library: a case is read as the plain content of its JSON file,
+predictions are superposed sample by sample, and the optimisation problem is the *full* form (5.6) with every
+sample's move, MV and CV as a variable. `objective` and `violation` judge a given plan (the benchmark's judge, in
+`studies.bench.problem`); `solve_qp`, `solve_scip` and `brute_force` find plans with other people's solvers.
+What they are good for stands beside the functions.
 """
 
 from __future__ import annotations
@@ -11,121 +12,23 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import scipy.sparse as sp
 
-STEP_ROUNDING = 1e-6  # [steps]: a limit so close to a whole number of steps counts as that number
+from studies.bench import peers
+from studies.bench.forms import Form, cv_units, move_units
+from studies.bench.problem import objective, predict, read, sample_moves, step_limits, violation
 
+__all__ = [
+    "objective",
+    "predict",
+    "read",
+    "sample_moves",
+    "violation",
+]  # the judge of the benchmark is ours, too
 
-def read(case: dict) -> SimpleNamespace:
-    """The numbers of a case file: arrays instead of lists, infinities instead of None, S continued to Hp."""
-    model, structure, tuning = case["model"], case["structure"], case["tuning"]
-    n = SimpleNamespace(cvs=len(model["cv"]), mvs=len(model["mv"]))
-    n.hp, n.hu, n.hw = (
-        structure[key] for key in ("prediction_horizon", "control_horizon", "first_penalised")
-    )
-    n.blocks = list(structure.get("blocks") or [1] * n.hu)
-    n.starts = [0, *itertools.accumulate(n.blocks)][:-1]
-    n.blocking = structure["blocking"]
-    n.step = [structure.get("integer_step", {}).get(name) for name in model["mv"]]
-    n.oscillation = [bool(tuning.get("oscillation_rows", {}).get(name)) for name in model["mv"]]
-    n.S = np.zeros((n.cvs, n.mvs, n.hp))
-    for c, m, j in np.ndindex(n.S.shape):
-        response = model["coefficients"][c][m]
-        n.S[c, m, j] = response[min(j, len(response) - 1)]
-    n.Q, n.P, n.S2, n.S1, n.c, n.rho = (
-        np.array(tuning[key], dtype=float)
-        for key in (
-            "cv_weight",
-            "move_weight",
-            "soft_quadratic",
-            "soft_linear",
-            "deadzone",
-            "slack_weight",
-        )
-    )
-    for name, key, missing in (
-        ("ylo", "cv_low", -np.inf),
-        ("yhi", "cv_high", np.inf),
-        ("ulo", "mv_low", -np.inf),
-        ("uhi", "mv_high", np.inf),
-        ("dlo", "move_low", -np.inf),
-        ("dhi", "move_high", np.inf),
-    ):
-        setattr(n, name, np.array([missing if v is None else v for v in tuning[key]], dtype=float))
-    n.u0, n.last = np.array(case["mv_now"], dtype=float), np.array(case["last_move"], dtype=float)
-    n.free, n.r = np.array(case["free_response"], dtype=float), np.array(case["setpoint"], dtype=float)
-    return n
-
-
-def sample_moves(case: dict, moves) -> np.ndarray:
-    """The move of every sample, "sample mv", of a plan "block mv"."""
-    n, moves = read(case), np.asarray(moves, dtype=float)
-    du = np.zeros((n.hu, n.mvs))
-    for b, (start, length) in enumerate(zip(n.starts, n.blocks, strict=True)):
-        if n.blocking == "moves":
-            du[start : start + length] = moves[b]
-        else:
-            du[start] = moves[b]
-    return du
-
-
-def predict(case: dict, moves) -> np.ndarray:
-    """The CVs at j = 1..Hp, "horizon cv": the free response plus one step response per move, (2.30)."""
-    n, du = read(case), sample_moves(case, moves)
-    y = n.free.copy()
-    for k in range(min(n.hu, n.hp)):
-        y[k:] += np.einsum("cmj,m->jc", n.S[:, :, : n.hp - k], du[k])
-    return y
-
-
-def objective(case: dict, moves) -> float:
-    """The cost (6.6) of a plan, constants included, with the slacks at their smallest values."""
-    n, y = read(case), predict(case, moves)
-    e = (y - n.r)[n.hw - 1 :]
-    eta = np.maximum(0.0, np.abs(e) - n.c)
-    above = np.maximum(0.0, (y - n.yhi)[n.hw - 1 :].max(axis=0))
-    below = np.maximum(0.0, (n.ylo - y)[n.hw - 1 :].max(axis=0))
-    du = sample_moves(case, moves)
-    return float(
-        (n.Q * e**2).sum()
-        + (n.P * du**2).sum()
-        + (n.S2 * eta**2 + n.S1 * eta).sum()
-        + (n.rho * (above + below)).sum()
-    )
-
-
-def violation(case: dict, moves) -> float:
-    """The largest violation of the hard constraints of a plan, 0 when there is none.
-
-    Limits of moves and MVs count relative to max(1, |limit|), integrality and oscillation in steps. An MV
-    that starts outside its limit by rounding widens the limit to where it is.
-    """
-    n, moves = read(case), np.asarray(moves, dtype=float)
-    if not np.isfinite(moves).all():
-        return math.inf
-    du = sample_moves(case, moves)
-    u = n.u0 + np.cumsum(du, axis=0)
-    worst = 0.0
-    for m in range(n.mvs):
-        low, high = min(n.ulo[m], n.u0[m]), max(n.uhi[m], n.u0[m])
-        for values, limit, sign in (
-            (du[:, m], n.dhi[m], 1),
-            (du[:, m], n.dlo[m], -1),
-            (u[:, m], high, 1),
-            (u[:, m], low, -1),
-        ):
-            if math.isfinite(limit):
-                worst = max(worst, (sign * (values - limit)).max() / max(1.0, abs(limit)))
-        if n.step[m]:
-            d = du[:, m] / n.step[m]
-            worst = max(worst, np.abs(d - np.round(d)).max())
-            if n.oscillation[m]:  # (6.16), the past move rounded to whole steps
-                past = round(n.last[m] / n.step[m])
-                worst = max(worst, np.abs(np.diff(d, prepend=past)).max() - 1.0)
-    return float(worst)
+QP_SOLVERS = {"clarabel": peers.clarabel, "piqp": peers.piqp, "daqp": peers.daqp}
 
 
 @dataclasses.dataclass
@@ -139,21 +42,6 @@ class Answer:
 
 
 # ------------------------------------------------------------------------------------ hard constraints alone
-
-
-def step_limits(n: SimpleNamespace, m: int) -> tuple[float, float, float, float]:
-    """Move and position limits of an integer MV in whole steps from where it is."""
-    step, up, down = n.step[m], math.floor, math.ceil
-
-    def whole(x, rounding, slack):
-        return rounding(x + slack) if math.isfinite(x) else x
-
-    return (
-        whole(n.dlo[m] / step, down, -STEP_ROUNDING),
-        whole(n.dhi[m] / step, up, STEP_ROUNDING),
-        min(0, whole((n.ulo[m] - n.u0[m]) / step, down, -STEP_ROUNDING)),
-        max(0, whole((n.uhi[m] - n.u0[m]) / step, up, STEP_ROUNDING)),
-    )
 
 
 def integer_plans(
@@ -234,48 +122,12 @@ def hard_feasible(case: dict) -> bool:
 # --------------------------------------------------------------------------------------------- the full form
 
 
-@dataclasses.dataclass
-class FullForm:
-    """min z'diag(q)z + c'z, row_low <= A z <= row_high, low <= z <= high, some z integer.
-
-    Variables: moves, MV changes since now, CV deviations from the setpoint, eps, eta; each divided by a unit
-    that keeps its size near one. Deviations instead of values keep the cost free of cancellation.
-    """
-
-    q: np.ndarray
-    c: np.ndarray
-    A: sp.csr_matrix
-    row_low: np.ndarray
-    row_high: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    starts: np.ndarray  # "block mv", where the moves of a plan are
-    units: np.ndarray  # of the moves, "mv"
-    integer: np.ndarray  # "mv"
-
-    @property
-    def integers(self) -> np.ndarray:
-        """Positions of the integer variables."""
-        return self.starts[:, self.integer].ravel()
-
-    def moves(self, z) -> np.ndarray:
-        """The plan "block mv" in MV units."""
-        return np.asarray(z)[self.starts] * self.units
-
-
-def full_form(case: dict) -> FullForm:
+def full_form(case: dict) -> Form:
     """The problem (5.6) with Soft MPC (6.12), blocks (6.2), whole steps (6.1), oscillation rows (6.16)."""
     n = read(case)
     horizon = n.hp - n.hw + 1
-    units = np.ones(n.mvs)
-    away = np.abs(n.free - n.r).max(axis=0) + n.c
-    for m in range(n.mvs):
-        limits = [abs(x) for x in (n.dlo[m], n.dhi[m], n.uhi[m] - n.ulo[m]) if math.isfinite(x) and x]
-        gains = np.abs(n.S[:, m]).max(axis=1)
-        reach = [d / g for d, g in zip(away, gains, strict=True) if d * g > 0]  # where nothing limits the MV
-        units[m] = n.step[m] or (max(limits[:2]) if limits else min(reach, default=1.0))
-    size = np.einsum("cmj,m->cmj", np.abs(n.S), units).max(axis=(1, 2))
-    size[size == 0] = 1.0
+    units = move_units(n)
+    size = cv_units(n, units)
 
     count = itertools.count()
 
@@ -352,8 +204,8 @@ def full_form(case: dict) -> FullForm:
                 high[slack] = 0.0
     place = [(r, k, v) for r, entries in enumerate(rows) for k, v in entries.items()]
     r_, k_, v_ = zip(*place, strict=True)
-    return FullForm(
-        q=q,
+    return Form(
+        P=sp.csc_matrix(sp.diags(2 * q)),
         c=c,
         A=sp.csr_matrix((v_, (r_, k_)), shape=(len(rows), total)),
         row_low=np.array(row_low),
@@ -366,20 +218,15 @@ def full_form(case: dict) -> FullForm:
     )
 
 
-def _rows(form: FullForm, fixed=None):
-    """Equalities (A, b) and inequalities (G, l, u), fixed variables among the equalities."""
+def _fixed(form: Form, steps=None) -> Form:
+    """The form without integers: relaxed, or with the integer moves fixed."""
     low, high = form.low.copy(), form.high.copy()
-    if fixed is not None:
-        low[form.integers] = high[form.integers] = np.asarray(fixed, dtype=float).ravel()
-    identity = sp.identity(len(low), format="csr")
-    A = sp.vstack([form.A, identity], format="csr")
-    lower, upper = np.r_[form.row_low, low], np.r_[form.row_high, high]
-    same = lower == upper
-    free = ~same & (np.isfinite(lower) | np.isfinite(upper))
-    return A[same], lower[same], A[free], lower[free], upper[free]
+    if steps is not None:
+        low[form.integers] = high[form.integers] = np.asarray(steps, dtype=float).ravel()
+    return dataclasses.replace(form, low=low, high=high, integer=np.zeros_like(form.integer))
 
 
-def solve_qp(case: dict, solver: str = "clarabel", fixed=None, form: FullForm | None = None) -> Answer:
+def solve_qp(case: dict, solver: str = "clarabel", fixed=None, form: Form | None = None) -> Answer:
     """The relaxed problem, or the one with the integer moves fixed, by somebody else's QP solver.
 
     The solvers run to 1e-10 in scaled units and `objective()` judges the plan. Over 3,000 random cases all that
@@ -392,82 +239,14 @@ def solve_qp(case: dict, solver: str = "clarabel", fixed=None, form: FullForm | 
         form: the full form of the case, if it is at hand.
     """
     form = form or full_form(case)
-    A, b, G, lower, upper = _rows(form, fixed)
-    if solver == "clarabel":
-        status, z, bound = _clarabel(form, A, b, G, lower, upper)
-    elif solver == "piqp":
-        status, z, bound = _piqp(form, A, b, G, lower, upper)
-    else:
-        status, z, bound = _daqp(form, A, b, G, lower, upper)
-    if status != "optimal":
-        return Answer(status)
-    moves = form.moves(z)
+    answer = QP_SOLVERS[solver](1e-10, 60.0)(_fixed(form, fixed))
+    if answer.status != "optimal" or answer.z is None:
+        return Answer(answer.status)
+    moves = form.moves(answer.z)
     if fixed is not None:
         moves[:, form.integer] = np.asarray(fixed, dtype=float).reshape(moves[:, form.integer].shape)
         moves[:, form.integer] *= form.units[form.integer]
-    return Answer("optimal", objective(case, moves), bound, moves)
-
-
-def _clarabel(form, A, b, G, lower, upper):
-    import clarabel
-
-    has_low, has_high = np.isfinite(lower), np.isfinite(upper)
-    M = sp.vstack([A, G[has_high], -G[has_low]], format="csc")
-    rhs = np.r_[b, upper[has_high], -lower[has_low]]
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-10
-    settings.max_iter = 200
-    cones = [clarabel.ZeroConeT(len(b)), clarabel.NonnegativeConeT(len(rhs) - len(b))]
-    P = sp.diags(2 * form.q).tocsc()
-    solution = clarabel.DefaultSolver(P, form.c, M, rhs, cones, settings).solve()
-    status = str(solution.status)
-    if status in ("Solved", "AlmostSolved"):
-        return "optimal", np.array(solution.x), solution.obj_val_dual
-    return ("infeasible" if "PrimalInfeasible" in status else "failed"), None, None
-
-
-def _piqp(form, A, b, G, lower, upper):
-    import piqp
-
-    solver = piqp.SparseSolver()
-    solver.settings.eps_abs = solver.settings.eps_rel = 1e-10
-    solver.settings.check_duality_gap = True
-    solver.settings.eps_duality_gap_abs = solver.settings.eps_duality_gap_rel = 1e-10
-    solver.settings.max_iter = 500
-    P = sp.diags(2 * form.q).tocsc()
-    solver.setup(P, form.c, A.tocsc(), b, G.tocsc(), lower, upper)
-    status = solver.solve()
-    if status == piqp.PIQP_SOLVED:
-        bound = solver.result.info.dual_obj
-        return "optimal", np.array(solver.result.x), bound
-    return ("infeasible" if status == piqp.PIQP_PRIMAL_INFEASIBLE else "failed"), None, None
-
-
-def _daqp(form, A, b, G, lower, upper):
-    import daqp
-
-    n = len(form.q)
-    M = np.ascontiguousarray(sp.vstack([A, G]).toarray())
-    low, high = np.r_[b, lower], np.r_[b, upper]
-    sense = np.r_[np.full(len(b), 5), np.zeros(len(lower))].astype(np.int32)  # 5: equality, always active
-    low, high = np.clip(low, -1e30, None), np.clip(high, None, 1e30)
-    H = np.diag(2 * form.q)
-    z, _, flag, _ = daqp.solve(
-        H,
-        form.c.copy(),
-        M,
-        high,
-        low,
-        sense,
-        primal_tol=1e-10,
-        dual_tol=1e-11,
-        eps_prox=1e-4,
-        iter_limit=100000,
-    )
-    if flag in (1, 2):
-        return "optimal", np.array(z)[:n], -math.inf  # an active set has no separate bound
-    return ("infeasible" if flag == -1 else "failed"), None, None
+    return Answer("optimal", objective(case, moves), answer.bound, moves)
 
 
 # ------------------------------------------------------------------------------------------ integer oracles
@@ -521,53 +300,12 @@ def solve_scip(case: dict, time_s: float = 60.0, gap: float = 1e-7) -> Answer:
 
     SCIP holds rows to 1e-6 absolute in scaled units, so its dual bound is good for about 1e-6 relative.
     """
-    import pyscipopt
-
     form = full_form(case)
-    model = pyscipopt.Model()
-    model.hideOutput()
-    model.setParam("limits/time", time_s)
-    model.setParam("limits/gap", gap)
-    model.setParam("numerics/feastol", 1e-8)
-    integer = set(form.integers.tolist())
-    z = []
-    for i, (low, high) in enumerate(zip(form.low, form.high, strict=True)):
-        z.append(
-            model.addVar(
-                vtype="I" if i in integer else "C",
-                lb=low if math.isfinite(low) else None,
-                ub=high if math.isfinite(high) else None,
-            )
-        )
-    for r in range(form.A.shape[0]):
-        part = slice(form.A.indptr[r], form.A.indptr[r + 1])
-        terms = pyscipopt.quicksum(
-            float(v) * z[k] for k, v in zip(form.A.indices[part], form.A.data[part], strict=True)
-        )
-        low, high = form.row_low[r], form.row_high[r]
-        if low == high:
-            model.addCons(terms == low)
-        else:
-            if math.isfinite(low):
-                model.addCons(terms >= low)
-            if math.isfinite(high):
-                model.addCons(terms <= high)
-    total = pyscipopt.quicksum(float(form.c[i]) * z[i] for i in np.flatnonzero(form.c))
-    for i in np.flatnonzero(form.q):  # one epigraph per square: the tightest outer approximation
-        t = model.addVar(lb=0.0)
-        model.addCons(z[i] * z[i] <= t)
-        total += float(form.q[i]) * t
-    model.setObjective(total, "minimize")
-    model.optimize()
-    status, bound = model.getStatus(), model.getDualbound()
-    if status == "infeasible":
-        return Answer("infeasible")
-    if model.getNSols() == 0:
-        return Answer("failed", bound=bound)
-    values = [model.getVal(variable) for variable in z]
-    polished = solve_qp(case, "clarabel", np.round(np.array(values)[form.integers]), form)
-    done = status in ("optimal", "gaplimit")
-    return Answer("optimal" if done else "limit", polished.objective, bound, polished.moves)
+    answer = peers.scip(gap, time_s)(form)
+    if answer.z is None:
+        return Answer("infeasible" if answer.status == "infeasible" else "failed", bound=answer.bound)
+    polished = solve_qp(case, "clarabel", np.round(answer.z[form.integers]), form)
+    return Answer(answer.status, polished.objective, answer.bound, polished.moves)
 
 
 # ---------------------------------------------------------------------------------------------- the judgement
@@ -583,7 +321,7 @@ def best_qp(case: dict) -> Answer:
     if not hard_feasible(case):
         return Answer("infeasible")
     form = full_form(case)
-    solvers = ("clarabel", "piqp", "daqp") if len(form.q) < 300 else ("clarabel", "piqp")
+    solvers = ("clarabel", "piqp", "daqp") if len(form.c) < 300 else ("clarabel", "piqp")
     answers = [solve_qp(case, solver, form=form) for solver in solvers]
     return min(answers, key=lambda answer: answer.objective)
 

@@ -23,13 +23,12 @@ DOORS = {
     "distributed": ("studies/",),
     "xarray": ("studies/", "figures/"),
     "zarr": ("studies/",),
+    "scipy": ("studies/bench/",),
+    **dict.fromkeys(
+        ("piqp", "clarabel", "osqp", "daqp", "qpax", "pyscipopt", "gurobipy"), ("studies/bench/peers.py",)
+    ),
 }
 TEST_ONLY = {
-    "piqp",
-    "daqp",
-    "clarabel",
-    "pyscipopt",
-    "scipy",
     "hypothesis",
     "pytest",
     "tests",

@@ -211,6 +211,7 @@ def test_an_output_that_cannot_be_written_is_refused_before_the_solve(write, tmp
         ["identify", "--samples", "many"],
         ["study", "run"],
         ["study", "run", "thesis", "--plant", "septic"],
+        ["bench", "relaxed"],
     ],
 )
 def test_unknown_commands_and_options_are_bad_input(arguments, unsolved, capsys):
@@ -225,11 +226,12 @@ def test_unknown_commands_and_options_are_bad_input(arguments, unsolved, capsys)
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], ["plan", "fmu", "identify", "study"]),
+        ([], ["plan", "fmu", "identify", "study", "bench"]),
         (["plan"], ["--out", "standard output", "--finish", "default: auto", "3 infeasible"]),
         (["fmu", "build"], ["--fmi", "default: 2"]),
         (["identify"], ["[%]", "[m3/h]", "default: 7500.0", "default: 250", "10 s"]),
         (["study", "run", "thesis"], ["default: results", "--quick", "default: fmu"]),
+        (["bench"], ["--quick", "default: all", "default: nowhere", "[ms]", "jaxmpc[bench]", "Ctrl-C"]),
     ],
 )
 def test_help_shows_defaults_and_units(arguments, words, capsys):

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from jaxmpc import status
-from jaxmpc.controller import ContinuousController, MixedIntegerController, shift_plan
+from jaxmpc.controller import ContinuousController, shift_plan
 from jaxmpc.disturbance import filter_bias
 from jaxmpc.errors import InputError
+from jaxmpc.mixed_integer import MixedIntegerController
 from jaxmpc.step_response import make_model
 from jaxmpc.structure import Structure
 from jaxmpc.tuning import make_tuning

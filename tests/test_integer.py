@@ -163,7 +163,7 @@ def test_scenarios_solved_together_get_the_answers_they_get_alone(problems):
     instances = jax.tree.map(lambda *leaves: np.stack(leaves), *(p[1] for p in problems))
     cold = jax.tree.map(lambda leaf: np.repeat(leaf[None], len(problems), axis=0), constants.cold)
     for finish in FINISHES:
-        together = solve_integers(
+        together, _ = solve_integers(
             Relaxer([constants]), instances, starts=[[] for _ in problems], warm=cold, finish=finish
         )
         for result, (*_, values) in zip(together, problems, strict=True):

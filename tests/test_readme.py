@@ -67,7 +67,7 @@ def test_every_command_of_the_table_exists_with_its_options_and_none_is_left_out
         options = set(re.findall(r"`(--[a-z]+)", listed))
         assert options <= options_of(words), command
         assert options == options_of(words) - {"-h", "--help"}, command
-    assert found == {"study run thesis", "identify", "fmu build", "plan"}
+    assert found == {"study run thesis", "identify", "fmu build", "plan", "bench"}
 
 
 def test_setting_up_is_one_command_for_the_main_job_and_one_for_the_tests_which_ci_runs():

@@ -12,7 +12,7 @@ from jaxmpc.condense import condense, make_instance
 from jaxmpc.newton import WarmStart, refine, warm_start_of
 from jaxmpc.qp import solve
 from jaxmpc.relaxation import solve_relaxed
-from jaxmpc.relaxed_problem import evaluate
+from jaxmpc.relaxed_problem import evaluate, prepare
 from jaxmpc.tuning import make_tuning
 
 LANES = 16
@@ -84,7 +84,7 @@ def test_no_feasible_plan_is_better_than_the_bound(batch, solved):
 
 def test_the_interior_point_alone_and_newton_from_nonsense_agree(batch, solved):
     _, qp, rows, instances = batch
-    alone = jax.jit(jax.vmap(lambda i: solve(qp, rows, i, i.lower, i.upper)))(instances)
+    alone = jax.jit(jax.vmap(lambda i: solve(prepare(qp, rows, i, i.lower, i.upper))))(instances)
     np.testing.assert_allclose(alone.objective, solved.objective, rtol=1e-6)
     rng = np.random.default_rng(2)
     n, m = qp.theta.shape[1], qp.theta.shape[0]
@@ -101,7 +101,7 @@ def test_the_interior_point_alone_and_newton_from_nonsense_agree(batch, solved):
 
 def test_newton_finishes_from_its_own_solution_and_never_claims_a_wrong_one(batch, solved):
     _, qp, rows, instances = batch
-    finish = jax.jit(jax.vmap(lambda i, s: refine(qp, rows, i, i.lower, i.upper, s)))
+    finish = jax.jit(jax.vmap(lambda i, s: refine(prepare(qp, rows, i, i.lower, i.upper), s)[0]))
     own = finish(instances, warm_start_of(solved))
     claimed = np.asarray(own.status) == status.OPTIMAL
     assert claimed.mean() > 0.5  # lanes at a CV limit are left to the interior point

@@ -1,0 +1,75 @@
+"""Closed loops of many mixed-integer controllers that advance together, sample by sample.
+
+The integer search decides on the host, so that there is no compiled scan; prediction, relaxations and the wells of all
+scenarios are single compiled calls. `closed_loop` is the only caller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from jaxmpc.batch import Lanes, map_lanes, per_lane, variant_mesh
+from jaxmpc.mixed_integer import MixedIntegerControllers
+from jaxmpc.noise import noise_samples
+from jaxmpc.plant import WellPlant
+
+REPORT = 20  # samples between two progress reports
+
+
+def advance_together(
+    controllers: MixedIntegerControllers,
+    plants: Lanes[WellPlant],
+    inputs: tuple[np.ndarray, np.ndarray],
+    noise: tuple[np.ndarray, np.ndarray],
+    record: Callable[..., dict],
+    tick: Callable[[int], None],
+) -> dict[str, np.ndarray]:
+    """Recorded fields ``"scenario sample ..."`` of a whole run.
+
+    Args:
+        controllers: one per scenario.
+        plants: one well for all, or one per scenario.
+        inputs: setpoints ``"scenario sample cv"`` and pressure offsets ``"scenario sample"`` [bar].
+        noise: standard deviations ``"scenario cv"`` [CV unit], and seeds with streams ``"scenario 2"``.
+        record: of ``(cv, mv, state, info)``; the fields to keep by name.
+        tick: told how many scenario samples were done.
+    """
+    setpoints, offsets = inputs
+    count, samples = setpoints.shape[:2]
+    errors = np.asarray(_errors(*noise, np.arange(samples)))
+    mesh = variant_mesh(jax.local_devices()[:1])
+    at = lambda k: per_lane(np.full(count, k, dtype=np.int32))  # noqa: E731
+    state, outputs = map_lanes(_start, [plants, at(0)], mesh)
+    cv = np.asarray(outputs.cv)
+    memory = controllers.init(cv, np.asarray(outputs.mv))
+    controllers.prepare(memory, cv)
+    tick(0)
+    fields: dict[str, np.ndarray] = {}
+    for k in range(samples):
+        measured = cv + errors[:, k]
+        memory, info = controllers.step(memory, measured, setpoints[:, k])
+        arguments = [plants, per_lane(state), per_lane(np.asarray(memory.mv)), per_lane(offsets[:, k].copy())]
+        state, outputs = map_lanes(WellPlant.step, arguments, mesh)
+        now = record(measured, outputs.mv, memory, info)
+        for name, value in now.items():
+            value = np.asarray(value)
+            if name not in fields:
+                fields[name] = np.empty((count, samples, *value.shape[1:]), dtype=value.dtype)
+            fields[name][:, k] = value
+        cv = np.asarray(outputs.cv)
+        if (k + 1) % REPORT == 0 or k + 1 == samples:
+            tick(count * (k % REPORT + 1))
+    return fields
+
+
+@jax.jit
+def _errors(deviation, seeds, samples):
+    return jax.vmap(lambda d, s: noise_samples(d, s[0], s[1], samples))(deviation, seeds)
+
+
+def _start(plant: WellPlant, _):
+    state = plant.init()
+    return state, plant.measure(state)

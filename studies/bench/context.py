@@ -1,0 +1,152 @@
+"""What every section of the benchmark is given: size of the run, recordings, peers, and where to say what it does."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from identify.step_test import identify_step_response
+from jaxmpc.reference import Reference
+from jaxmpc.step_response import StepResponseModel
+from studies import references
+from studies.bench.instances import MODES, Mode, Recordings
+from studies.bench.judge import LONG, REPEATS
+from studies.bench.peers import Peer, PeerAnswer, Solve
+from studies.bench.rows import Row
+
+
+@dataclasses.dataclass(frozen=True)
+class Size:
+    """How much is measured.
+
+    Attributes:
+        modes: blocking modes.
+        run: samples of a recorded run, None for the whole reference.
+        relaxed, exact: problems per blocking mode.
+        hardest: longest solves of a run, measured beside the others.
+        lanes: distinct problems of a batch; larger batches repeat them.
+        batches: batch sizes; 512 has the floor.
+        peer_share: of the problems a slow peer is asked; one that would be asked none is left out.
+        cut_off: most seconds that one solve of a peer may take.
+        variants, variant_samples: of the continuous closed loops advanced together.
+        together, together_samples: of the mixed-integer closed loops advanced together.
+        growth: of horizon [samples], blocks, CVs and MVs.
+        startup_modes: blocking modes whose first call is measured.
+    """
+
+    modes: tuple[Mode, ...] = MODES
+    run: int | None = None
+    relaxed: int = 130
+    exact: int = 130
+    hardest: int = 10
+    lanes: int = 512
+    batches: tuple[int, ...] = (1, 8, 64, 512, 4096)
+    peer_share: float = 1.0
+    cut_off: float = 15.0
+    variants: int = 256
+    variant_samples: int = 900
+    together: int = 64
+    together_samples: int = 1200
+    together_reference: Callable[[], Reference] = references.thesis
+    growth: tuple[tuple[str, tuple[int, ...]], ...] = (
+        ("horizon", (60, 125, 250, 500)),
+        ("blocks", (4, 8, 16, 32)),
+        ("CVs", (1, 2, 4, 8)),
+        ("MVs", (1, 2, 4, 8)),
+    )
+    startup_modes: tuple[Mode, ...] = MODES
+
+
+FULL = Size()
+QUICK = Size(
+    run=300,
+    relaxed=12,
+    exact=12,
+    hardest=3,
+    lanes=32,
+    batches=(1, 512),
+    peer_share=0.12,
+    cut_off=5.0,
+    variants=256,
+    variant_samples=300,
+    together=64,
+    together_samples=120,
+    together_reference=references.quick,
+    growth=(("horizon", (60,)), ("blocks", (4,)), ("CVs", (4,)), ("MVs", (4,))),
+    startup_modes=("moves",),
+)
+
+
+@dataclasses.dataclass
+class Context:
+    """Shared by the sections of one call.
+
+    Attributes:
+        size: how much is measured.
+        quick: whether the reference is the short one.
+        say: receives a line of progress.
+        qp_peers, miqp_peers: solvers beside us.
+        series: numbers for figures, filled by the sections.
+    """
+
+    size: Size
+    quick: bool
+    say: Callable[[str], None]
+    qp_peers: tuple[Peer, ...]
+    miqp_peers: tuple[Peer, ...]
+    series: dict[str, dict[str, list[float]]] = dataclasses.field(default_factory=dict)
+
+    @functools.cached_property
+    def model(self) -> StepResponseModel:
+        """Identified from the JAX well."""
+        return identify_step_response()
+
+    @functools.cached_property
+    def recordings(self) -> Recordings:
+        """The closed loops that the problems come from."""
+        reference = references.quick() if self.quick else references.thesis()
+        return Recordings(self.model, reference, self.size.run, self.say)
+
+
+def asked(peer: Peer, context: Context, count: int) -> np.ndarray:
+    """Positions of the problems that a peer is asked, evenly spread: all, a few for a slow one, or none."""
+    most = min(count, round(peer.limit * context.size.peer_share))
+    return np.unique(np.linspace(0, count - 1, most).astype(int))
+
+
+def ask(
+    peer: Peer, context: Context, cases: Iterable[dict], tolerance: float
+) -> tuple[np.ndarray, list[PeerAnswer], list[np.ndarray | None]]:
+    """Let a peer solve problems.
+
+    Returns:
+        Seconds ``"problem"``, answers, and plans ``"block mv"`` [MV unit] or None.
+    """
+    limit = min(peer.hopeless, context.size.cut_off)
+    solve: Solve = peer.begin(tolerance, limit)
+    seconds, answers, plans = [], [], []
+    for case in cases:
+        form = peer.build(case)
+        if peer.keeps and not answers:
+            solve(form)  # sets up what is set up once
+        taken: list[float] = []
+        while not taken or (len(taken) < REPEATS and taken[0] < LONG):
+            answer = solve(form)
+            taken.append(answer.seconds)
+        seconds.append(float(np.median(taken)))
+        answers.append(answer)
+        plans.append(None if answer.z is None else form.moves(answer.z))
+    return np.array(seconds), answers, plans
+
+
+def absent(peer: Peer, context: Context, section: str, name: str) -> Row | None:
+    """The row of a peer that is not installed or left out of this run, None for one that is asked."""
+    why = peer.missing()
+    if why is not None:
+        return Row(name=name, section=section, status="missing", note=why)
+    if not len(asked(peer, context, 1_000_000)):
+        return Row(name=name, section=section, status="not measured", note="too slow for this size of run")
+    return None

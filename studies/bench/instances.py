@@ -1,0 +1,281 @@
+"""Problems of single samples, recorded in closed loops on the well (thesis chapter 7), for both blocking modes.
+
+A recording is the trajectory of a run. The problems come from replaying it through the controller's own memory, so that a
+sample has exactly the free response, history and limits it had in the loop, without solving anything. Recordings are
+kept in the cache under a hash of everything that decides them but the solver: the same problems every time.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import os
+import time
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmpc.case import Case, case_to_dict
+from jaxmpc.closed_loop import simulate
+from jaxmpc.controller import ContinuousController
+from jaxmpc.files import write_atomically
+from jaxmpc.mixed_integer import MixedIntegerController
+from jaxmpc.plant import WellPlant
+from jaxmpc.reference import Reference
+from jaxmpc.step_response import StepResponseModel
+from jaxmpc.structure import Structure
+from jaxmpc.trajectory import Trajectory
+from jaxmpc.tuning import Tuning
+from jaxmpc.well import well_hash
+from studies import presets
+from studies.fingerprint import content_hash
+
+Kind = Literal["continuous", "mixed-integer"]
+Mode = Literal["moves", "inputs"]
+MODES: tuple[Mode, ...] = ("moves", "inputs")
+RECORDING_FORMAT = 1
+WARM_UP = 20  # samples before the clock of a run starts
+FIELDS = ("setpoint", "cv", "move", "mv_demand", "gap", "fallback", "solve_time")
+
+
+def cache_folder() -> Path:
+    """Where recordings are kept: ``$JAXMPC_CACHE``, or ``~/.cache/jaxmpc``."""
+    return Path(os.environ.get("JAXMPC_CACHE") or Path.home() / ".cache" / "jaxmpc") / "bench"
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """What a closed-loop run leaves for the benchmark, time first.
+
+    Attributes:
+        setpoint, cv: ``"sample cv"`` [CV unit].
+        move, mv_demand: ``"sample mv"`` [MV unit].
+        gap: ``"sample"``, relative gap of the plan.
+        fallback: ``"sample"``, whether there was no plan.
+        solve_time: ``"sample"`` [s].
+        wall_time: of the run, plant included, first compilation not [s].
+    """
+
+    setpoint: np.ndarray
+    cv: np.ndarray
+    move: np.ndarray
+    mv_demand: np.ndarray
+    gap: np.ndarray
+    fallback: np.ndarray
+    solve_time: np.ndarray
+    wall_time: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Problems:
+    """Problems of single samples, ``"problem"`` first; values as `jaxmpc.condense.make_instance` takes them."""
+
+    free_response: np.ndarray
+    setpoint: np.ndarray
+    mv_now: np.ndarray
+    last_move: np.ndarray
+    past_moves: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.mv_now)
+
+    def at(self, i: int) -> dict[str, Any]:
+        """One problem by the names of `Planner.solve`."""
+        return {field.name: getattr(self, field.name)[i] for field in dataclasses.fields(self)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Instances:
+    """Recorded problems with those of the sample before, which a warm start comes from.
+
+    Attributes:
+        structure, tuning, model: of the controller.
+        sample: ``"problem"``, where in the run they are.
+        now, before: the problems, and those one sample earlier.
+    """
+
+    structure: Structure
+    tuning: Tuning
+    model: StepResponseModel
+    sample: np.ndarray
+    now: Problems
+    before: Problems
+
+    def __len__(self) -> int:
+        return len(self.sample)
+
+    def case(self, i: int) -> dict[str, Any]:
+        """The content of a case file, with the limits of the first move that the mean-move limit (6.6) sets."""
+        problem = self.now.at(i)
+        past = problem.pop("past_moves")
+        body = case_to_dict(Case(self.model, self.structure, self.tuning, **problem))
+        mean, limit = past.mean(axis=0), np.asarray(self.tuning.mean_move_limit) * (1.0 + 1e-9)
+        body["first_move_high"] = np.where(mean > limit, 0.0, np.inf).tolist()
+        body["first_move_low"] = np.where(mean < -limit, 0.0, -np.inf).tolist()
+        return body
+
+
+class SteppedWell:
+    """The JAX well stepped from the host, so that every sample of the loop has its own solve time."""
+
+    def __init__(self, plant: WellPlant):
+        self.plant, self.dt = plant, plant.dt
+        self._step = eqx.filter_jit(WellPlant.step)
+
+    def init(self):
+        """Steady state at the default working point; returns its outputs."""
+        self.state = self.plant.init()
+        return self.plant.measure(self.state)
+
+    def step(self, mv, disturbance: float = 0.0):
+        """One sample; returns the outputs at its end."""
+        self.state, outputs = self._step(self.plant, self.state, jnp.asarray(mv), jnp.asarray(disturbance))
+        return outputs
+
+
+def make_controller(kind: Kind, mode: Mode, model: StepResponseModel) -> Any:
+    """The controller of the thesis preset."""
+    structure = presets.structure(mode, integer=kind == "mixed-integer")
+    maker = MixedIntegerController if kind == "mixed-integer" else ContinuousController
+    return maker(structure, presets.tuning(structure), model)
+
+
+class Recordings:
+    """Recordings of one benchmark run: from this run, from the cache, or made now.
+
+    Args:
+        model: prediction model of every controller.
+        reference: setpoints of the runs.
+        samples: length of the runs, None for the whole reference.
+        say: receives a line per recording.
+    """
+
+    def __init__(
+        self,
+        model: StepResponseModel,
+        reference: Reference,
+        samples: int | None = None,
+        say: Callable[[str], None] = lambda line: None,
+    ):
+        self.model, self.reference, self.samples, self.say = model, reference, samples, say
+        self._live: dict[tuple[Kind, Mode], Recording] = {}
+        self._kept: dict[tuple[Kind, Mode], Recording] = {}
+
+    def live(self, kind: Kind, mode: Mode) -> Recording:
+        """The run made now, once per benchmark: its times are of this machine and code."""
+        if (kind, mode) not in self._live:
+            controller = make_controller(kind, mode, self.model)
+            plant = SteppedWell(WellPlant(actuator="step"))
+            simulate(controller, plant, self.reference, samples=WARM_UP)
+            self.say(f"{kind} run, {mode}")
+            begin = time.perf_counter()
+            run = simulate(controller, plant, self.reference, samples=self.samples)
+            made = _recording(run, time.perf_counter() - begin)
+            self._live[kind, mode] = made
+            path = self.path(kind, mode)
+            if _load(path) is None:
+                write_atomically(path, _bytes(made))
+        return self._live[kind, mode]
+
+    def path(self, kind: Kind, mode: Mode) -> Path:
+        """File of a recording, named by its content key."""
+        controller = make_controller(kind, mode, self.model)
+        tuning = {field.name: getattr(controller.tuning, field.name) for field in dataclasses.fields(Tuning)}
+        key = content_hash(
+            RECORDING_FORMAT,
+            kind,
+            dataclasses.asdict(controller.structure),
+            tuning,
+            np.asarray(self.model.coefficients),
+            well_hash(WellPlant().parameters),
+            self.reference.sample(self.model.dt, self.samples),
+        )
+        return cache_folder() / f"{kind}-{mode}-{key[:20]}.npz"
+
+    def kept(self, kind: Kind, mode: Mode) -> Recording:
+        """The recording in the cache, else the run made now; its problems stay the same from run to run."""
+        if (kind, mode) not in self._kept:
+            stored = _load(self.path(kind, mode))
+            self._kept[kind, mode] = stored if stored is not None else self.live(kind, mode)
+        return self._kept[kind, mode]
+
+    def instances(self, kind: Kind, mode: Mode, count: int, *, hardest: bool = False) -> Instances:
+        """Problems spread evenly over a recorded run, or the ones that took longest.
+
+        Args:
+            kind: of the controller.
+            mode: blocking mode.
+            count: how many at most.
+            hardest: take the longest solves in place of evenly spread ones.
+        """
+        recording = self.kept(kind, mode)
+        usable = np.arange(2, len(recording.cv))
+        if hardest:
+            chosen = np.sort(usable[np.argsort(-recording.solve_time[usable], kind="stable")[:count]])
+        else:
+            chosen = usable[np.unique(np.linspace(0, len(usable) - 1, count + 2).astype(int)[1:-1])]
+        controller = make_controller(kind, mode, self.model)
+        problems = replay(controller, recording)
+        return Instances(
+            controller.structure,
+            controller.tuning,
+            self.model,
+            chosen,
+            _take(problems, chosen),
+            _take(problems, chosen - 1),
+        )
+
+
+def replay(controller, recording: Recording) -> Problems:
+    """The problem of every sample of a recording, without solving any.
+
+    Args:
+        controller: the one that made the recording.
+        recording: its run.
+    """
+    memory, structure = controller.memory, controller.structure
+    start = controller.init(recording.cv[0], recording.mv_demand[0] - recording.move[0])
+    nothing = jnp.zeros((structure.block_count, structure.mv_count))
+
+    @jax.jit
+    def run(state, cvs, moves):
+        def sample(state, inputs):
+            cv, move = inputs
+            state, free = memory.observe(state, cv)
+            problem = free, state.mv, state.last_move, state.past_moves
+            return memory.remember(state, move, nothing, state.warm), problem
+
+        return jax.lax.scan(sample, state, (cvs, moves))[1]
+
+    free, now, last, past = jax.tree.map(np.asarray, run(start, recording.cv, recording.move))
+    setpoint = np.broadcast_to(recording.setpoint[:, None, :], free.shape)
+    return Problems(free, setpoint, now, last, past)
+
+
+def _take(problems: Problems, index: np.ndarray) -> Problems:
+    return Problems(*(getattr(problems, field.name)[index] for field in dataclasses.fields(problems)))
+
+
+def _recording(run: Trajectory, wall_time: float) -> Recording:
+    return Recording(**{name: getattr(run, name) for name in FIELDS}, wall_time=wall_time)
+
+
+def _bytes(recording: Recording) -> bytes:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **dataclasses.asdict(recording))
+    return buffer.getvalue()
+
+
+def _load(path: Path) -> Recording | None:
+    """A stored recording; None if there is none or it cannot be read."""
+    try:
+        with np.load(path) as stored:
+            return Recording(**{name: stored[name] for name in FIELDS}, wall_time=float(stored["wall_time"]))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None

@@ -1,0 +1,386 @@
+"""Other people's solvers behind one interface; the one door of the benchmark to each of them.
+
+A peer gets a problem as a `forms.Form`, solves it, and says how long its own work took. Nothing is timed but the solver:
+matrices are converted before the clock starts. A solver that can keep its factorisation pattern between samples with
+equal matrices (PIQP, Clarabel, OSQP) is set up once per run of samples and updated; the others start anew each time.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import importlib.metadata
+import importlib.util
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from jaxmpc.highs import solve_qp as highs_qp
+from studies.bench import forms
+from studies.bench.forms import Form, binaries_of, rows_of, same_matrices
+
+HUGE = 1e30  # what solvers without infinity call infinite
+
+
+@dataclasses.dataclass
+class PeerAnswer:
+    """What a peer found.
+
+    Attributes:
+        status: ``optimal``, ``limit``, ``infeasible`` or ``failed``.
+        z: variables of the form, None without a point.
+        bound: the solver's own lower bound of the cost without constants.
+        seconds: what its own work took [s].
+    """
+
+    status: str
+    z: np.ndarray | None = None
+    bound: float = -math.inf
+    seconds: float = math.nan
+
+
+Solve = Callable[[Form], PeerAnswer]
+
+
+@dataclasses.dataclass(frozen=True)
+class Peer:
+    """A solver that the benchmark compares with.
+
+    Attributes:
+        name: as printed.
+        package: distribution on the package index that brings it.
+        module: what is imported.
+        build: the form it is fastest with.
+        begin: ``(tolerance, seconds per solve) -> solve``; keeps what it may keep between samples.
+        timed: what its time covers, for the table.
+        keeps: whether it is set up once for samples with equal matrices.
+        limit: samples it is asked at most, because it is slow.
+        hopeless: seconds after which one solve is cut off.
+    """
+
+    name: str
+    package: str
+    module: str
+    build: Callable[[dict], Form]
+    begin: Callable[[float, float], Solve]
+    timed: str
+    keeps: bool = False
+    limit: int = 10_000
+    hopeless: float = 10.0
+
+    def missing(self) -> str | None:
+        """Why it cannot be used, None if it can."""
+        if importlib.util.find_spec(self.module) is None:
+            return f"{self.package} is not installed (pip install 'jaxmpc[bench]')"
+        return None
+
+    def version(self) -> str:
+        """Of the installed package."""
+        try:
+            return importlib.metadata.version(self.package)
+        except importlib.metadata.PackageNotFoundError:
+            return "?"
+
+
+# ------------------------------------------------------------------------------------------------ relaxed QPs
+
+
+def piqp(tolerance: float, seconds: float) -> Solve:
+    """PIQP with sparse matrices: proximal interior point."""
+    import piqp
+
+    held: dict[str, Any] = {"form": None}
+
+    def solve(form: Form) -> PeerAnswer:
+        A, b, G, low, high = rows_of(form)
+        fixed = np.flatnonzero(form.low == form.high)  # an interior point needs an interior
+        identity: Any = sp.identity(len(form.c), format="csr")
+        A: Any = sp.vstack([A, identity[fixed]])
+        b, box_low, box_high = np.r_[b, form.low[fixed]], form.low.copy(), form.high.copy()
+        box_low[fixed], box_high[fixed] = -math.inf, math.inf
+        keep = same_matrices(held["form"], form)
+        vectors = dict(c=form.c, b=b, h_l=low, h_u=high, x_l=box_low, x_u=box_high)
+        matrices = form.P, A.tocsc(), G.tocsc()
+        begin = time.perf_counter()
+        if keep:
+            solver = held["solver"]
+            solver.update(**vectors)
+        else:
+            solver = piqp.SparseSolver()
+            chosen = solver.settings
+            chosen.eps_abs = chosen.eps_rel = tolerance
+            chosen.check_duality_gap = True
+            chosen.eps_duality_gap_abs = chosen.eps_duality_gap_rel = tolerance
+            chosen.max_iter = 500
+            P, A, G = matrices
+            solver.setup(P, form.c, A, b, G, low, high, box_low, box_high)
+        status = solver.solve()
+        elapsed = time.perf_counter() - begin
+        held.update(form=form, solver=solver)
+        if status != piqp.PIQP_SOLVED:
+            infeasible = status == piqp.PIQP_PRIMAL_INFEASIBLE
+            return PeerAnswer("infeasible" if infeasible else "failed", seconds=elapsed)
+        return PeerAnswer("optimal", np.array(solver.result.x), solver.result.info.dual_obj, elapsed)
+
+    return solve
+
+
+def clarabel(tolerance: float, seconds: float) -> Solve:
+    """Clarabel: homogeneous interior point."""
+    import clarabel
+
+    library: Any = clarabel  # its compiled names are unknown to type checkers
+    held: dict[str, Any] = {"form": None}
+
+    def solve(form: Form) -> PeerAnswer:
+        A, b, G, low, high = rows_of(form, boxes=True)
+        has_low, has_high = np.isfinite(low), np.isfinite(high)
+        M = sp.vstack([A, G[has_high], -G[has_low]], format="csc")
+        right = np.r_[b, high[has_high], -low[has_low]]
+        settings = library.DefaultSettings()
+        settings.verbose, settings.max_iter, settings.time_limit = False, 200, seconds
+        settings.presolve_enable = False  # so that vectors can be updated
+        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
+        cones = [library.ZeroConeT(len(b)), library.NonnegativeConeT(len(right) - len(b))]
+        upper = sp.triu(form.P, format="csc")
+        keep = same_matrices(held["form"], form)
+        begin = time.perf_counter()
+        if keep:
+            solver = held["solver"]
+            solver.update(q=form.c, b=right)
+        else:
+            solver = library.DefaultSolver(upper, form.c, M, right, cones, settings)
+        found = solver.solve()
+        elapsed = time.perf_counter() - begin
+        held.update(form=form, solver=solver)
+        status = str(found.status)
+        if status in ("Solved", "AlmostSolved"):
+            return PeerAnswer("optimal", np.array(found.x), found.obj_val_dual, elapsed)
+        return PeerAnswer("infeasible" if "PrimalInfeasible" in status else "failed", seconds=elapsed)
+
+    return solve
+
+
+def osqp(tolerance: float, seconds: float) -> Solve:
+    """OSQP: operator splitting; polished, and stopped at 1e-6 as it rarely gets further."""
+    import osqp
+
+    held: dict[str, Any] = {"form": None}
+
+    def solve(form: Form) -> PeerAnswer:
+        A = sp.vstack([form.A, sp.identity(len(form.c))], format="csc")
+        low = np.maximum(np.r_[form.row_low, form.low], -HUGE)
+        high = np.minimum(np.r_[form.row_high, form.high], HUGE)
+        upper = sp.triu(form.P, format="csc")
+        keep = same_matrices(held["form"], form)
+        limits = dict(eps_abs=max(tolerance, 1e-6), eps_rel=max(tolerance, 1e-6), time_limit=seconds)
+        begin = time.perf_counter()
+        if keep:
+            solver = held["solver"]
+            solver.warm_start(x=np.zeros(len(form.c)), y=np.zeros(len(low)))  # the samples are no neighbours
+            solver.update(q=form.c, l=low, u=high)
+        else:
+            solver = osqp.OSQP()
+            solver.setup(
+                upper, form.c, A, low, high, verbose=False, polishing=True, max_iter=20_000, **limits
+            )
+        found = solver.solve(raise_error=False)
+        elapsed = time.perf_counter() - begin
+        held.update(form=form, solver=solver)
+        if found.x is None or not np.isfinite(found.x).all():
+            return PeerAnswer("failed", seconds=elapsed)
+        good = found.info.status in ("solved", "solved inaccurate")
+        return PeerAnswer("optimal" if good else "limit", np.array(found.x), seconds=elapsed)
+
+    return solve
+
+
+def daqp(tolerance: float, seconds: float) -> Solve:
+    """DAQP: dual active set on dense matrices; integers become binaries that it branches on."""
+    import daqp
+
+    def solve(form: Form) -> PeerAnswer:
+        form, spread = binaries_of(form)
+        A, b, G, low, high = rows_of(form)
+        rows = np.ascontiguousarray(sp.vstack([A, G]).toarray())
+        lower = np.clip(np.r_[form.low, b, low], -HUGE, None)
+        upper = np.clip(np.r_[form.high, b, high], None, HUGE)
+        sense = np.zeros(len(lower), dtype=np.int32)
+        sense[lower == upper] = 5  # an equation, always active
+        if spread is not None:
+            sense[spread.binary] = 16
+        hessian = np.ascontiguousarray(form.P.toarray())
+        options = dict(primal_tol=max(tolerance, 1e-10), dual_tol=1e-11, eps_prox=1e-4, iter_limit=100_000)
+        begin = time.perf_counter()
+        x, _, flag, _ = daqp.solve(
+            hessian, form.c.copy(), rows, upper, lower, sense, time_limit=seconds, **options
+        )
+        elapsed = time.perf_counter() - begin
+        if flag in (
+            1,
+            2,
+            4,
+        ):  # 4: solved, but the proximal term leaves its certificate open; the judge decides
+            z = np.array(x)[: len(form.c)]
+            return PeerAnswer(
+                "optimal", z if spread is None else spread.back @ z + spread.base, seconds=elapsed
+            )
+        return PeerAnswer("infeasible" if flag == -1 else "limit", seconds=elapsed)
+
+    return solve
+
+
+def highs(tolerance: float, seconds: float) -> Solve:
+    """The QP solver of HiGHS: primal active set."""
+
+    def solve(form: Form) -> PeerAnswer:
+        begin = time.perf_counter()
+        status, z = highs_qp(
+            form.P, form.c, form.A, form.row_low, form.row_high, form.low, form.high, seconds=seconds
+        )
+        return PeerAnswer(status, z, seconds=time.perf_counter() - begin)
+
+    return solve
+
+
+def qpax(tolerance: float, seconds: float) -> Solve:
+    """qpax: dense interior point in JAX; compiled before the clock starts."""
+    import jax
+    import jax.numpy as jnp
+    import qpax
+
+    run = jax.jit(lambda *data: qpax.solve_qp(*data, solver_tol=max(tolerance, 1e-6)))
+    ready: set[tuple[int, ...]] = set()
+
+    def solve(form: Form) -> PeerAnswer:
+        A, b, G, low, high = rows_of(form, boxes=True)
+        has_low, has_high = np.isfinite(low), np.isfinite(high)
+        rows = sp.vstack([G[has_high], -G[has_low]]).toarray()
+        right = np.r_[high[has_high], -low[has_low]]
+        data = [jnp.asarray(v) for v in (form.P.toarray(), form.c, A.toarray(), b, rows, right)]
+        if rows.shape not in ready:
+            jax.block_until_ready(run(*data))
+            ready.add(rows.shape)
+        begin = time.perf_counter()
+        found: Any = jax.block_until_ready(run(*data))
+        elapsed = time.perf_counter() - begin
+        z, converged = np.asarray(found[0]), bool(found[4])
+        return PeerAnswer("optimal" if converged else "limit", z, seconds=elapsed)
+
+    return solve
+
+
+# ---------------------------------------------------------------------------------------------- exact MIQPs
+
+
+def scip(tolerance: float, seconds: float) -> Solve:
+    """SCIP: branch and cut; one epigraph variable per square, the tightest outer approximation. Needs a diagonal P."""
+    import pyscipopt
+
+    def solve(form: Form) -> PeerAnswer:
+        model = pyscipopt.Model()
+        model.hideOutput()
+        for name, value in (
+            ("limits/time", seconds),
+            ("limits/gap", tolerance),
+            ("numerics/feastol", 1e-8),
+        ):
+            model.setParam(name, value)
+        integer = set(form.integers.tolist())
+        z = [
+            model.addVar(
+                vtype="I" if i in integer else "C",
+                lb=low if math.isfinite(low) else None,
+                ub=high if math.isfinite(high) else None,
+            )
+            for i, (low, high) in enumerate(zip(form.low, form.high, strict=True))
+        ]
+        for r in range(form.A.shape[0]):
+            part = slice(form.A.indptr[r], form.A.indptr[r + 1])
+            terms = pyscipopt.quicksum(
+                float(v) * z[k] for k, v in zip(form.A.indices[part], form.A.data[part], strict=True)
+            )
+            low, high = form.row_low[r], form.row_high[r]
+            if low == high:
+                model.addCons(terms == low)
+                continue
+            if math.isfinite(low):
+                model.addCons(terms >= low)
+            if math.isfinite(high):
+                model.addCons(terms <= high)
+        total = pyscipopt.quicksum(float(form.c[i]) * z[i] for i in np.flatnonzero(form.c))
+        squares = form.P.diagonal() / 2
+        for i in np.flatnonzero(squares):
+            t = model.addVar(lb=0.0)
+            model.addCons(z[i] * z[i] <= t)
+            total += float(squares[i]) * t
+        model.setObjective(total, "minimize")
+        begin = time.perf_counter()
+        model.optimize()
+        elapsed = time.perf_counter() - begin
+        status, bound = model.getStatus(), model.getDualbound()
+        if status == "infeasible":
+            return PeerAnswer("infeasible", seconds=elapsed)
+        if model.getNSols() == 0:
+            return PeerAnswer("limit" if status == "timelimit" else "failed", bound=bound, seconds=elapsed)
+        point = np.array([model.getVal(variable) for variable in z])
+        done = status in ("optimal", "gaplimit")
+        return PeerAnswer("optimal" if done else "limit", point, bound, elapsed)
+
+    return solve
+
+
+def gurobi(tolerance: float, seconds: float) -> Solve:
+    """Gurobi. The licence in its package ends at 200 variables where terms are quadratic: too few for the thesis size."""
+    import gurobipy
+
+    environment = gurobipy.Env(params={"OutputFlag": 0})
+
+    def solve(form: Form) -> PeerAnswer:
+        with gurobipy.Model(env=environment) as started:
+            model: Any = started
+            kinds = np.full(len(form.c), "C")
+            kinds[form.integers] = "I"
+            z = model.addMVar(len(form.c), lb=form.low, ub=form.high, vtype=kinds)
+            A, b, G, low, high = rows_of(form)
+            model.addConstr(A @ z == b)
+            up, down = np.isfinite(high), np.isfinite(low)
+            model.addConstr(G[up] @ z <= high[up])
+            model.addConstr(G[down] @ z >= low[down])
+            model.setObjective(0.5 * (z @ form.P @ z) + form.c @ z)
+            model.Params.TimeLimit, model.Params.MIPGap = seconds, tolerance
+            model.Params.FeasibilityTol = model.Params.IntFeasTol = 1e-9
+            begin = time.perf_counter()
+            model.optimize()
+            elapsed = time.perf_counter() - begin
+            if model.Status == gurobipy.GRB.INFEASIBLE:
+                return PeerAnswer("infeasible", seconds=elapsed)
+            if not model.SolCount:
+                return PeerAnswer("limit", seconds=elapsed)
+            done = model.Status == gurobipy.GRB.OPTIMAL
+            return PeerAnswer("optimal" if done else "limit", np.array(z.X), model.ObjBound, elapsed)
+
+    return solve
+
+
+_UPDATED = "update of the vectors and solve; set up once per run"
+_ANEW = "setup and solve"
+QP_PEERS = (
+    Peer("PIQP sparse", "piqp", "piqp", forms.lifted, piqp, _UPDATED, True),
+    Peer("Clarabel", "clarabel", "clarabel", forms.lifted, clarabel, _UPDATED, True, limit=60),
+    Peer(
+        "OSQP 1e-6", "osqp", "osqp", lambda case: forms.dense(case).scaled(), osqp, _UPDATED, True, limit=20
+    ),
+    Peer("DAQP", "daqp", "daqp", forms.dense, daqp, _ANEW, limit=12),
+    Peer("HiGHS QP", "highspy", "highspy", forms.lifted, highs, _ANEW, limit=8, hopeless=2.0),
+    Peer("qpax", "qpax", "qpax", forms.dense, qpax, "solve, compiled before", limit=2),
+)
+MIQP_PEERS = (
+    Peer("SCIP", "pyscipopt", "pyscipopt", forms.lifted, scip, "solve", limit=5, hopeless=15.0),
+    Peer("Gurobi", "gurobipy", "gurobipy", forms.lifted, gurobi, "solve", limit=20, hopeless=20.0),
+    Peer("DAQP", "daqp", "daqp", forms.dense, daqp, _ANEW, limit=5, hopeless=10.0),
+)

@@ -1,0 +1,241 @@
+"""One row of the benchmark, what it must reach, and the table and the JSON file made of all rows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+RIGHT = 1e-6  # relative error up to which a solution counts
+COLUMNS = (
+    "name",
+    "n",
+    "median ms",
+    "p99 ms",
+    "rate /s",
+    "total s",
+    "ratio",
+    "worst error",
+    "floor",
+    "aim",
+    "met",
+)
+FORMAT = 1
+
+Quantity = Literal["median_ms", "p99_ms", "rate", "ratio", "seconds"]
+_SHOWN = {
+    "median_ms": "median {} ms",
+    "p99_ms": "p99 {} ms",
+    "rate": "{} /s",
+    "ratio": "{}x",
+    "seconds": "{} s",
+}
+_LARGER_IS_BETTER = ("rate", "ratio")
+
+
+class Goal(msgspec.Struct, frozen=True):
+    """What a row must reach.
+
+    Attributes:
+        quantity: field of the row.
+        floor: that must be reached.
+        aim: beyond the floor, None for none.
+    """
+
+    quantity: Quantity
+    floor: float
+    aim: float | None = None
+
+    def met(self, row: Row) -> bool | None:
+        """Whether the row reaches the floor with solutions that count; None where that is not known."""
+        value = getattr(row, self.quantity)
+        if row.status != "measured" or value is None:
+            return None
+        if not row.counts:
+            return False
+        if self.quantity == "ratio" and row.ratio_is_lower_bound and value < self.floor:
+            return None
+        return value >= self.floor if self.quantity in _LARGER_IS_BETTER else value <= self.floor
+
+
+class Row(msgspec.Struct, kw_only=True):
+    """One line of the benchmark.
+
+    Attributes:
+        name: what was measured.
+        section: that it belongs to.
+        status: ``measured``, ``missing`` (a peer that is not installed), ``failed`` or ``not measured``.
+        instances: problems that were tried, or samples of a run.
+        solved: how many of them have a solution that counts.
+        median_ms, p99_ms: time per problem [ms].
+        rate: problems per second.
+        seconds: of the whole, where that is what matters [s].
+        ratio: how many times as fast as `ratio_to` on the problems that both were given.
+        ratio_to: the peer.
+        ratio_is_lower_bound: the peer was stopped at its time limit.
+        worst_error: largest error of the solutions, see `judge.error`; None where there are none.
+        counts: whether no solution is wrong by more than `RIGHT`.
+        goals: floors and aims.
+        note: how it was measured.
+    """
+
+    name: str
+    section: str
+    status: Literal["measured", "missing", "failed", "not measured"] = "measured"
+    instances: int | None = None
+    solved: int | None = None
+    median_ms: float | None = None
+    p99_ms: float | None = None
+    rate: float | None = None
+    seconds: float | None = None
+    ratio: float | None = None
+    ratio_to: str | None = None
+    ratio_is_lower_bound: bool = False
+    worst_error: float | None = None
+    counts: bool = True
+    goals: tuple[Goal, ...] = ()
+    note: str = ""
+
+
+def timed(name: str, section: str, seconds: Sequence[float] | np.ndarray, errors, **more: Any) -> Row:
+    """A row from the time and the error of every problem.
+
+    Args:
+        name, section: of the row.
+        seconds: ``"problem"`` [s].
+        errors: ``"problem"``; not a number for a problem without a solution.
+        **more: further fields of `Row`.
+    """
+    seconds, errors = np.asarray(seconds, dtype=float), np.asarray(errors, dtype=float)
+    found = errors[~np.isnan(errors)]
+    worst = float(found.max()) if len(found) else None
+    return Row(
+        name=name,
+        section=section,
+        instances=len(errors),
+        solved=int((found <= RIGHT).sum()),
+        median_ms=float(np.median(seconds)) * 1e3,
+        p99_ms=float(np.percentile(seconds, 99)) * 1e3,
+        rate=len(seconds) / float(seconds.sum()),
+        worst_error=worst,
+        counts=worst is not None and worst <= RIGHT,
+        **more,
+    )
+
+
+class Report(msgspec.Struct, kw_only=True):
+    """Everything one call of the benchmark measured; the content of its JSON file.
+
+    Attributes:
+        format: of this file.
+        machine: cores, load, versions, devices.
+        options: of the call.
+        complete: False while it runs and after an interrupt.
+        rows: measured so far.
+        series: numbers over a run or over batch sizes, by name, for figures.
+    """
+
+    format: int = FORMAT
+    machine: dict[str, Any] = {}
+    options: dict[str, Any] = {}
+    complete: bool = False
+    rows: list[Row] = []
+    series: dict[str, dict[str, list[float]]] = {}
+
+    def to_json(self) -> str:
+        """The JSON file, infinite and missing numbers as null, with whether each floor is met."""
+        body = msgspec.to_builtins(self)
+        for row, made in zip(self.rows, body["rows"], strict=True):
+            for goal, shown in zip(row.goals, made["goals"], strict=True):
+                shown["met"] = goal.met(row)
+        return msgspec.json.format(msgspec.json.encode(_finite(body)), indent=1).decode() + "\n"
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    return [_finite(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+
+
+def table(report: Report) -> str:
+    """The rows as aligned text with the machine above and the notes below."""
+    lines = [cells(row) for row in report.rows]
+    widths = [max(len(line[i]) for line in [COLUMNS, *lines]) for i in range(len(COLUMNS))]
+    left = (0, 8, 9, 10)  # text columns; the others hold numbers
+
+    def shown(line: Sequence[str]) -> str:
+        cut = [
+            cell.ljust(w) if i in left else cell.rjust(w)
+            for i, (cell, w) in enumerate(zip(line, widths, strict=True))
+        ]
+        return "  ".join(cut).rstrip()
+
+    out = [machine_line(report.machine), "", shown(COLUMNS)]
+    section = None
+    for row, line in zip(report.rows, lines, strict=True):
+        if row.section != section:
+            out.append("-" * (sum(widths) + 2 * (len(widths) - 1)))
+            section = row.section
+        out.append(shown(line))
+    if any(not row.counts for row in report.rows):
+        out += ["", f"! does not count: a solution is wrong by more than {RIGHT:g}, or there is none"]
+    if any(row.ratio_is_lower_bound for row in report.rows):
+        out += ["", ">= the peer was stopped at its time limit on some problems"]
+    notes: dict[tuple[str, str], str] = {}
+    for row in report.rows:  # said once, for the first of the rows that share it
+        if row.note:
+            notes.setdefault((row.section, row.note), row.name)
+    out += ["", *(f"{name}: {note}." for (_, note), name in notes.items())] if notes else []
+    if not report.complete:
+        out += ["", "Not complete: what is above was measured before the benchmark was stopped."]
+    return "\n".join(out) + "\n"
+
+
+def cells(row: Row) -> list[str]:
+    """The texts of one line."""
+    tried = "" if row.instances is None else str(row.instances)
+    if row.solved is not None and row.solved != row.instances:
+        tried = f"{row.solved} of {row.instances}"
+    ratio = (
+        ""
+        if row.ratio is None
+        else f"{'>= ' if row.ratio_is_lower_bound else ''}{number(row.ratio)}x {row.ratio_to}"
+    )
+    error = "" if row.worst_error is None else f"{row.worst_error:.0e}"
+    verdicts = [goal.met(row) for goal in row.goals]
+    words = [{None: "-", True: "met", False: "missed"}[verdict] for verdict in verdicts]
+    met = ", ".join(words if len(set(words)) > 1 else words[:1])
+    if row.status != "measured":
+        error = row.status
+    elif not row.counts:
+        error = f"! {error}".rstrip()
+    elif row.solved == 0:
+        error = "none solved"
+    aims = [goal for goal in row.goals if goal.aim is not None]
+    return [
+        row.name,
+        tried,
+        *(number(value) for value in (row.median_ms, row.p99_ms, row.rate, row.seconds)),
+        ratio,
+        error,
+        ", ".join(_SHOWN[goal.quantity].format(number(goal.floor)) for goal in row.goals),
+        ", ".join(_SHOWN[goal.quantity].format(number(goal.aim)) for goal in aims),
+        met,
+    ]
+
+
+def number(value: float | None) -> str:
+    """Three digits, nothing where there is no value."""
+    if value is None or not math.isfinite(value):
+        return ""
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def machine_line(machine: dict[str, Any]) -> str:
+    """The machine in one line."""
+    return ", ".join(f"{key} {value}" for key, value in machine.items())

@@ -1,0 +1,143 @@
+"""Runs the sections of the benchmark, keeps every row as it comes, and writes what there is when it is stopped."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from jaxmpc.errors import InputError
+from jaxmpc.files import write_atomically
+from studies.bench.context import FULL, QUICK, Context, Size
+from studies.bench.peers import MIQP_PEERS, QP_PEERS, Peer
+from studies.bench.rows import Report, Row, table
+from studies.bench.sections import exact, growth, loops, relaxed, startup
+from studies.fingerprint import versions
+
+Section = Callable[[Context], Iterator[Row]]
+SECTIONS: dict[str, Section] = {
+    "relaxed": relaxed.one_at_a_time,
+    "batch": relaxed.batches,
+    "exact": exact.exact,
+    "loop": loops.loops,
+    "growth": growth.growth,
+    "startup": startup.startup,
+    "gpu": relaxed.devices,
+}
+
+
+def chosen_sections(only: str | None) -> list[str]:
+    """Names of the sections to run, in their order.
+
+    Args:
+        only: names with commas between, None for all.
+
+    Raises:
+        InputError: for an unknown name or none at all.
+    """
+    if only is None:
+        return list(SECTIONS)
+    names = [name.strip() for name in only.split(",")]
+    for name in names:
+        if name not in SECTIONS:
+            raise InputError("--only", name, f"sections with commas between, of {', '.join(SECTIONS)}")
+    return [name for name in SECTIONS if name in names]
+
+
+def run_bench(
+    *,
+    quick: bool = False,
+    only: str | None = None,
+    json_path: Path | None = None,
+    size: Size | None = None,
+    peers: tuple[tuple[Peer, ...], tuple[Peer, ...]] = (QP_PEERS, MIQP_PEERS),
+    say: Callable[[str], None] | None = None,
+) -> Report:
+    """Measure, and return what was measured; an interrupt or an error ends it early with the rows so far.
+
+    Args:
+        quick: a few problems of a short run, under two minutes.
+        only: sections with commas between, see `SECTIONS`; None for all.
+        json_path: file that gets every row, replaced as a whole after each section.
+        size: how much is measured, if neither the full nor the quick amount.
+        peers: QP and MIQP solvers to compare with; ratios are to the first of each.
+        say: receives lines of progress; standard error if not given.
+
+    Returns:
+        `Report`; `complete` is False if it ended early.
+
+    Raises:
+        InputError: for an unknown section, before anything is measured.
+    """
+    names = chosen_sections(only)
+    begin = time.perf_counter()
+
+    def progress(line: str) -> None:
+        print(f"[{time.perf_counter() - begin:6.1f} s] {line}", file=sys.stderr, flush=True)
+
+    context = Context(size or (QUICK if quick else FULL), quick, say or progress, *peers)
+    report = Report(machine=machine(peers), options={"quick": quick, "sections": names})
+    report.series = context.series
+    complete = True
+    try:
+        for name in names:
+            complete &= _section(name, context, report)
+            _write(report, json_path)
+        report.complete = complete
+    except KeyboardInterrupt:
+        (say or progress)("interrupted")
+    _write(report, json_path)
+    return report
+
+
+def _section(name: str, context: Context, report: Report) -> bool:
+    """Append the rows of a section; an error ends it with a row that says so. True if it came to its end."""
+    try:
+        for row in SECTIONS[name](context):
+            report.rows.append(row)
+    except Exception as error:  # one section must not cost the others their rows
+        what = " ".join(f"{type(error).__name__}: {error}".split())
+        context.say(f"{name} ended early: {what}")
+        report.rows.append(
+            Row(name=f"{name}: ended early", section=name, status="failed", counts=False, note=what)
+        )
+        return False
+    return True
+
+
+def _write(report: Report, path: Path | None) -> None:
+    if path is not None:
+        write_atomically(path, report.to_json())
+
+
+def wrong(report: Report) -> list[str]:
+    """Names of our own rows whose solutions do not count."""
+    peers = {peer.name for peer in (*QP_PEERS, *MIQP_PEERS)}
+    return [row.name for row in report.rows if not row.counts and row.name.rpartition(": ")[2] not in peers]
+
+
+def machine(peers: tuple[tuple[Peer, ...], ...] = ()) -> dict[str, str]:
+    """Cores, load, versions and devices of this machine, by name, for the first line of the table."""
+    import jax
+
+    known = versions()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    load = f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
+    devices = sorted({device.device_kind for device in jax.devices()})
+    out = {
+        "machine": f"{platform.system()} {platform.machine()}",
+        "cores": str(cores),
+        "load before": load,
+        "device": " and ".join(devices),
+        **{name: known[name] for name in ("python", "jaxmpc", "jax", "numpy", "highspy")},
+    }
+    for peer in dict.fromkeys(peer for group in peers for peer in group):
+        if peer.package != "highspy":
+            out[peer.package] = peer.version()
+    return out
+
+
+__all__ = ["SECTIONS", "chosen_sections", "machine", "run_bench", "table", "wrong"]

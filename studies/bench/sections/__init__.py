@@ -1,0 +1,1 @@
+"""What the benchmark measures, one module per section; each yields its rows as they are measured."""

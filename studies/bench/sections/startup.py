@@ -1,0 +1,70 @@
+"""The first call of a fresh process, compilation included."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from jaxmpc.plan import Planner
+from studies.bench.context import Context
+from studies.bench.judge import Judge
+from studies.bench.rows import Goal, Row, timed
+
+PATIENCE = 600.0  # s
+
+
+def startup(context: Context) -> Iterator[Row]:
+    """Rows ``first call, MODE``: `jaxmpc plan` on a recorded sample with an empty compilation cache, and again."""
+    for mode in context.size.startup_modes:
+        instances = context.recordings.instances("mixed-integer", mode, 5)
+        cases = [instances.case(i) for i in range(len(instances))]
+        # a case file has no limits of the first move alone
+        free = [
+            i
+            for i, case in enumerate(cases)
+            if not np.isfinite(case["first_move_high"] + case["first_move_low"]).any()
+        ]
+        i = free[len(free) // 2]
+        case = {key: value for key, value in cases[i].items() if not key.startswith("first_move")}
+        judge = Judge([case])
+        planner = Planner(instances.structure, instances.tuning, instances.model)
+        problem = instances.now.at(i)
+        problem["past_moves"] = None
+        judge.hear("in process", [planner.solve(**problem).moves])
+        with tempfile.TemporaryDirectory(prefix="jaxmpc-bench-") as folder:
+            for call in ("first", "second"):
+                context.say(f"{call} call, {mode}")
+                seconds, plan = _plan(case, Path(folder))
+                judge.hear(call, [plan])
+                row = timed(f"{call} call, {mode}", "startup", np.full(1, seconds), judge.errors(call))
+                row.median_ms = row.p99_ms = row.rate = None
+                row.seconds = seconds
+                row.goals = (Goal("seconds", 30.0, 8.0),) if call == "first" else ()
+                row.note = "`jaxmpc plan` in a process of its own, " + (
+                    "nothing compiled before" if call == "first" else "compiled programs taken from disk"
+                )
+                yield row
+
+
+def _plan(case: dict, folder: Path) -> tuple[float, np.ndarray | None]:
+    """Seconds of a process that plans one case, and its plan ``"block mv"`` [MV unit]."""
+    given, out = folder / "case.json", folder / "plan.json"
+    given.write_text(json.dumps(case))
+    environment = {**os.environ, "JAXMPC_CACHE": str(folder / "cache")}
+    for name in ("JAX_COMPILATION_CACHE_DIR", "JAXMPC_NO_JIT_CACHE"):
+        environment.pop(name, None)
+    command = [sys.executable, "-m", "jaxmpc.cli", "plan", str(given), "--out", str(out)]
+    begin = time.perf_counter()
+    subprocess.run(command, env=environment, check=False, timeout=PATIENCE, capture_output=True)
+    seconds = time.perf_counter() - begin
+    moves = json.loads(out.read_text())["moves"] if out.exists() else None
+    out.unlink(missing_ok=True)
+    return seconds, None if moves is None else np.array(moves)
