@@ -113,9 +113,14 @@ class MixedIntegerControllers:
         begin, compiled = time.perf_counter(), self.solver.compiling
         known = np.isfinite(np.asarray(cv)).all(axis=1)
         target = np.asarray(setpoint, dtype=np.float64)
-        state, free_response = _observe(self.memory, state, np.asarray(cv, dtype=np.float64))
+        narrow = self.solver.relaxer(1)
+        state, free_response, ready = _observe(
+            self.memory, narrow.lanes, state, np.asarray(cv, dtype=np.float64), target
+        )
 
         def instances_of(relaxer: Relaxer) -> QpInstance:
+            if relaxer is narrow:
+                return ready
             return _instances(self.memory, relaxer.lanes, state, free_response, target)
 
         relaxer, instances, results, roots = self.solver.solve(
@@ -164,11 +169,14 @@ def _init(memory: Lanes[Memory], cv, mv, cold: WarmStart) -> ControllerState:
 
 
 @jax.jit
-def _observe(memory: Lanes[Memory], state: ControllerState, cv):
+def _observe(memory: Lanes[Memory], qps: Lanes[CondensedQp], state: ControllerState, cv, setpoint):
+    """Bias and free response after a measurement, and the problems for moves of one step: ``"scenario"``."""
+
     def lane(own, state, cv):
         return eqx.combine(own, memory.shared).observe(state, cv)
 
-    return jax.vmap(lane)(memory.each, state, cv)
+    state, free_response = jax.vmap(lane)(memory.each, state, cv)
+    return state, free_response, _instances(memory, qps, state, free_response, setpoint)
 
 
 @jax.jit
