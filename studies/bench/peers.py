@@ -167,7 +167,7 @@ def clarabel(tolerance: float, seconds: float) -> Solve:
 
 def osqp(tolerance: float, seconds: float) -> Solve:
     """OSQP: operator splitting; polished, and stopped at 1e-6 as it rarely gets further."""
-    import osqp
+    import osqp  # pyright: ignore[reportMissingImports]
 
     held: dict[str, Any] = {"form": None}
 
@@ -251,7 +251,7 @@ def qpax(tolerance: float, seconds: float) -> Solve:
     """qpax: dense interior point in JAX; compiled before the clock starts."""
     import jax
     import jax.numpy as jnp
-    import qpax
+    import qpax  # pyright: ignore[reportMissingImports]
 
     run = jax.jit(lambda *data: qpax.solve_qp(*data, solver_tol=max(tolerance, 1e-6)))
     ready: set[tuple[int, ...]] = set()
@@ -336,7 +336,7 @@ def scip(tolerance: float, seconds: float) -> Solve:
 
 def gurobi(tolerance: float, seconds: float) -> Solve:
     """Gurobi. The licence in its package ends at 200 variables where terms are quadratic: too few for the thesis size."""
-    import gurobipy
+    import gurobipy  # pyright: ignore[reportMissingImports]
 
     environment = gurobipy.Env(params={"OutputFlag": 0})
 
