@@ -191,6 +191,8 @@ def _simulate_on_host(controller, plant, inputs, progress: Progress | None):
     compiled = isinstance(controller, ContinuousController)
     if compiled:  # compile before the clock starts
         jax.block_until_ready(_jitted_step(controller, state, np.asarray(outputs.cv), setpoints[0]))
+    elif isinstance(controller, MixedIntegerController):
+        controller.prepare(state, np.asarray(outputs.cv))
     records = []
     for k in range(len(setpoints)):
         cv = np.asarray(outputs.cv) + errors[k]

@@ -263,6 +263,10 @@ class MixedIntegerController:
         check_vector("mv", mv, self.structure.mv_names, "MV unit")
         return _first(self._together.init(np.asarray(cv)[None], np.asarray(mv)[None]))
 
+    def prepare(self, state: ControllerState, cv) -> None:
+        """Compile what every sample needs; arguments as in `step`."""
+        self.step(state, cv, cv)
+
     def step(self, state: ControllerState, cv, setpoint) -> tuple[ControllerState, StepInfo]:
         """One sample; arguments as in `ContinuousController.step`."""
         lane = jax.tree.map(lambda leaf: np.asarray(leaf)[None], state)
