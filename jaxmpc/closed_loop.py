@@ -187,28 +187,52 @@ def _simulate_on_host(controller, plant, inputs, progress: Progress | None):
     setpoints, offsets, errors = inputs
     host = _HostWell(plant) if isinstance(plant, WellPlant) else plant
     outputs = host.init()
-    state: ControllerState = controller.init(np.asarray(outputs.cv), np.asarray(outputs.mv))
-    compiled = isinstance(controller, ContinuousController)
-    if compiled:  # compile before the clock starts
-        jax.block_until_ready(_jitted_step(controller, state, np.asarray(outputs.cv), setpoints[0]))
-    elif isinstance(controller, MixedIntegerController):
-        controller.prepare(state, np.asarray(outputs.cv))
+    now = np.asarray(outputs.cv)
+    stepper: Any = _Compiled(controller)
+    if isinstance(controller, MixedIntegerController):
+        stepper = _BatchOfOne(controller.together)
+    state: ControllerState = stepper.init(now, np.asarray(outputs.mv))
+    stepper.prepare(state, now)
     records = []
     for k in range(len(setpoints)):
         cv = np.asarray(outputs.cv) + errors[k]
-        begin = time.perf_counter()
-        if compiled:
-            state, info = jax.block_until_ready(_jitted_step(controller, state, cv, setpoints[k]))
-            elapsed = time.perf_counter() - begin
-        else:
-            state, info = controller.step(state, cv, setpoints[k])
-            elapsed = float(info.solve_time)
-        outputs = host.step(np.asarray(state.mv), float(offsets[k]))
-        record = _record(cv, outputs.mv, state, info) | {"solve_time": elapsed}
-        records.append(jax.tree.map(np.asarray, record))
+        state, record = stepper.step(state, cv, setpoints[k])
+        outputs = host.step(record["mv_demand"], float(offsets[k]))
+        records.append(record | {"mv": np.asarray(outputs.mv)})
         if progress is not None and ((k + 1) % 20 == 0 or k + 1 == len(setpoints)):
             progress(k + 1, len(setpoints))
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *records)
+    return {name: np.stack([record[name] for record in records]) for name in records[0]}
+
+
+class _Compiled:
+    """A continuous controller that is stepped from the host, with a clock."""
+
+    def __init__(self, controller: ContinuousController):
+        self.controller, self.init = controller, controller.init
+
+    def prepare(self, state, cv) -> None:
+        jax.block_until_ready(_jitted_step(self.controller, state, cv, cv))
+
+    def step(self, state, cv, setpoint):
+        begin = time.perf_counter()
+        state, info = jax.block_until_ready(_jitted_step(self.controller, state, cv, setpoint))
+        record = _record(cv, info.mv, state, info) | {"solve_time": time.perf_counter() - begin}
+        return state, {name: np.asarray(value) for name, value in record.items()}
+
+
+class _BatchOfOne:
+    """One mixed-integer controller, its state kept with the scenario axis."""
+
+    def __init__(self, controllers: MixedIntegerControllers):
+        self.controllers, self.prepare = controllers, lambda state, cv: controllers.prepare(state, cv[None])
+
+    def init(self, cv, mv) -> ControllerState:
+        return self.controllers.init(cv[None], mv[None])
+
+    def step(self, state, cv, setpoint):
+        state, info = self.controllers.step(state, cv[None], setpoint[None])
+        record = _record(cv[None], info.mv, state, info) | {"solve_time": info.solve_time}
+        return state, {name: value[0] for name, value in record.items()}
 
 
 # ------------------------------------------------------------------------------------------------------- sweeps

@@ -14,7 +14,6 @@ envelope of d^2 through the integers, a sum of deadzone terms with half widths 0
 from __future__ import annotations
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -49,6 +48,9 @@ class CondensedQp(eqx.Module):
         soft_quadratic, soft_linear, deadzone: S, s, c per row.
         slack_weight: rho per CV.
         scale: MV units per unit of x.
+        row_size: squared length of every row of theta.
+        bend: curvature of every move outside all deadzones.
+        reach: what one unit of one move can do to a CV at most.
     """
 
     response: Float[Array, "row n"]
@@ -62,6 +64,9 @@ class CondensedQp(eqx.Module):
     deadzone: Float[Array, " row"]
     slack_weight: Float[Array, " cv"]
     scale: Float[Array, " n"]
+    row_size: Float[Array, " row"]
+    bend: Float[Array, " n"]
+    reach: Float[Array, " cv"]
     has_limits: bool = eqx.field(static=True)
 
     @property
@@ -175,6 +180,9 @@ def condense(
     response = jnp.concatenate([raw, np.tile(unit, (len(steps), 1))])
     pad = lambda values, tail: jnp.concatenate([values, tail])  # noqa: E731
     slope = jnp.concatenate([(1.0 if m == 0 else 2.0) * weight[integer] for m in steps])
+    soft_quadratic = pad(per_cv(tuning.soft_quadratic), jnp.zeros(extra))
+    squares = response**2
+    largest = jnp.max(jnp.abs(by_cv), axis=1)
     pay = packed and mvs * blocks <= PACKED_LIMIT
     return CondensedQp(
         response=response,
@@ -183,11 +191,14 @@ def condense(
         curvature=tracking + jnp.diag(2.0 * weight),
         move_weight=weight * own,
         quadratic=pad(quadratic, jnp.zeros(extra)),
-        soft_quadratic=pad(per_cv(tuning.soft_quadratic), jnp.zeros(extra)),
+        soft_quadratic=soft_quadratic,
         soft_linear=pad(per_cv(tuning.soft_linear), slope),
         deadzone=pad(per_cv(tuning.deadzone), jnp.repeat(jnp.asarray(steps, dtype=float), len(integer))),
         slack_weight=tuning.slack_weight,
         scale=scale,
+        row_size=squares @ scale**2,
+        bend=2.0 * (soft_quadratic @ squares) * scale**2,
+        reach=jnp.max(largest * scale, axis=1),
         has_limits=has_limits,
     )
 
@@ -333,17 +344,12 @@ def _implied_range(low, high, counts, integer: bool):
 
 def _fastest_return(limit, watch, held, counts, *, sign):
     """Position at the block ends when every move is as large as its limit and the oscillation rows allow."""
-
-    def advance(carry, entry):
-        previous, position = carry
-        most, count = entry
-        slowed = jnp.where(watch, previous + sign, sign * jnp.inf)
-        move = jnp.minimum(most, slowed) if sign > 0 else jnp.maximum(most, slowed)
-        move = jnp.where(jnp.isfinite(move), move, sign * 1e9)
-        return (move, position + count * move), position + count * move
-
-    _, ends = jax.lax.scan(advance, (held, jnp.zeros_like(held)), (limit, counts))
-    return ends
+    # a move is at most one step more than the one before it: the least of all earlier limits and the steps since
+    steps = np.subtract.outer(np.arange(len(limit)), np.arange(-1, len(limit)))
+    reach = sign * jnp.concatenate([held[None], limit]) + steps
+    slowed = jnp.where(watch & (steps >= 0) | (steps == 0), reach, jnp.inf).min(axis=1)
+    move = sign * jnp.where(jnp.isfinite(slowed), slowed, 1e9)
+    return jnp.sum(np.tri(len(limit)) * (counts * move), axis=1)
 
 
 def _window_budget(structure: Structure, tuning: Tuning, past_moves, mv: int):

@@ -154,10 +154,12 @@ def outside_limits(tuning: Tuning, mv: Float[Array, " mv"]) -> Bool[Array, ""]:
     return jnp.any((mv < tuning.mv_low - drift) | (mv > tuning.mv_high + drift))
 
 
-def first_move(structure: Structure, qp: CondensedQp, instance: QpInstance, move: Float[Array, " mv"]):
+def first_move(
+    structure: Structure, scale: Float[Array, " n"], instance: QpInstance, move: Float[Array, " mv"]
+):
     """The move to apply [MV unit]: solver tolerance must not leave what the limits allow the first block."""
     blocks = structure.block_count
-    unit = qp.scale[::blocks]
+    unit = scale[::blocks]
     low, high = instance.lower[::blocks], instance.upper[::blocks]
     first = first_position_rows(structure)
     held = moves_per_block(structure)[0]
@@ -241,7 +243,7 @@ class ContinuousController(eqx.Module):
         scale = jnp.maximum(jnp.abs(objective), 1e-6 * jnp.max(jnp.diagonal(self.qp.curvature)))
         gap = (objective - bound) / scale
         good = (solution.status == codes.OPTIMAL) & jnp.all(jnp.isfinite(moves)) & jnp.all(jnp.isfinite(cv))
-        move = first_move(structure, self.qp, instance, moves[0])
+        move = first_move(structure, self.qp.scale, instance, moves[0])
         move = jnp.where(good, move, 0.0)
         moves = jnp.where(good, moves, 0.0)
         recovering = outside_limits(tuning, state.mv)

@@ -77,7 +77,8 @@ def solve_integers(
     instances: QpInstance,
     *,
     starts: list[list[np.ndarray]],
-    warm: WarmStart,
+    warm: WarmStart | None = None,
+    root: Relaxations | None = None,
     gap: float = 1e-6,
     time_limit: float | None = None,
     finish: str = "auto",
@@ -89,6 +90,7 @@ def solve_integers(
         instances: their problems.
         starts: incumbents to try, per scenario.
         warm: where each root relaxation starts.
+        root: the root relaxations where they are known already, in place of `warm`.
         gap: relative gap.
         time_limit: seconds of work per scenario.
         finish: path that has to close the problems.
@@ -98,7 +100,8 @@ def solve_integers(
     """
     count = len(instances.lower)
     begin, compiled = time.perf_counter(), relaxer.compiling
-    root = relaxer.solve_roots(instances, warm)
+    if root is None:
+        root = relaxer.solve_roots(instances, relaxer.fitting(warm, count))
     seconds = time.perf_counter() - begin - (relaxer.compiling - compiled)
     results: list[SearchResult | None] = [None] * count
     open_searches = []

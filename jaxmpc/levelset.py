@@ -16,7 +16,9 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxmpc.propagation import Chain
+from jaxmpc.propagation import Chain, satisfied
+
+GRID = 1024  # combinations up to which all are evaluated at once
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +112,7 @@ def enumerate_below(
     most: int | None,
     beam: int | None = None,
 ) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """All whole moves within limits whose bound is below `cutoff`, by breadth-first search over the blocks.
+    """All whole moves within limits whose bound is below `cutoff`: as a grid, or by breadth-first search over the blocks.
 
     Args:
         model: lower bound.
@@ -124,6 +126,9 @@ def enumerate_below(
         ``(moves "point integer", bounds "point", least)`` sorted by bound, `least` being the smallest bound of
         what was left out (infinite if nothing was), or None.
     """
+    sizes = np.maximum(upper - lower + 1, 0)
+    if beam is None and np.prod(sizes.astype(float)) <= GRID:
+        return _grid_below(model, chains, lower, upper, sizes, cutoff)
     owners = [(k, b) for b in range(len(chains[0].columns)) for k in range(len(chains))]
     moves = np.zeros((1, 0), dtype=int)
     bounds = np.array([model.value])
@@ -160,6 +165,22 @@ def enumerate_below(
     result[:, model.order[: moves.shape[1]]] = moves
     rank = np.argsort(bounds, kind="stable")
     return result[rank], bounds[rank], least
+
+
+def _grid_below(model: LowerModel, chains: list[Chain], lower, upper, sizes, cutoff: float):
+    """`enumerate_below` where all combinations are few: every one is looked at."""
+    points = np.repeat(lower[None], int(np.prod(sizes)), axis=0)
+    free = np.flatnonzero(sizes > 1)
+    points[:, free] += np.indices(sizes[free]).reshape(len(free), len(points)).T
+    points = points[satisfied(chains, points, lower, upper)]
+    away = (points - model.center)[:, model.order] @ model.leading.T
+    own = model.excess[np.arange(len(lower)), points - model.lower].sum(axis=1)
+    bounds = model.value + own + 0.5 * (away**2).sum(axis=1)
+    below = bounds < cutoff
+    least = bounds[~below].min(initial=np.inf) if np.isfinite(cutoff) else np.inf
+    points, bounds = points[below], bounds[below]
+    rank = np.argsort(bounds, kind="stable")
+    return points[rank], bounds[rank], least
 
 
 def assignment_order(blocks: int, chains: int) -> Int[np.ndarray, " integer"]:

@@ -24,10 +24,11 @@ from jaxmpc.controller import ControllerState, Memory, StepInfo, first_move, out
 from jaxmpc.errors import InputError
 from jaxmpc.integer import FINISHES
 from jaxmpc.newton import WarmStart
+from jaxmpc.packing import Packing
 from jaxmpc.plan import Planner
-from jaxmpc.relaxer import Relaxer
+from jaxmpc.relaxer import LEAN, Relaxer, Solved, relax, relaxations
 from jaxmpc.step_response import StepResponseModel, check_match
-from jaxmpc.step_solver import StepSolver, fitting
+from jaxmpc.step_solver import StepSolver
 from jaxmpc.structure import Structure, check_vector
 from jaxmpc.tuning import Tuning
 
@@ -81,6 +82,7 @@ class MixedIntegerControllers:
                 for t, m in zip(self.solver.tunings, self.solver.models, strict=True)
             ]
         )
+        self._packings: dict[Any, Any] = {}
 
     def init(
         self, cv: Float[np.ndarray, "scenario cv"], mv: Float[np.ndarray, "scenario mv"]
@@ -90,12 +92,16 @@ class MixedIntegerControllers:
             if np.shape(value) != (self.count, len(names)) or not np.isfinite(value).all():
                 expected = f"finite numbers of shape {[self.count, len(names)]}"
                 raise InputError(path, f"shape {list(np.shape(value))}", expected)
-        cold = fitting(None, self.solver.relaxer(1), self.count)
-        return _init(self.memory, cv, mv, cold)
+        cold = self.solver.relaxer(1).fitting(None, self.count)
+        return jax.tree.map(np.asarray, _init(self.memory, cv, mv, cold))
 
     def prepare(self, state: ControllerState, cv: Float[np.ndarray, "scenario cv"]) -> None:
-        """Compile what every sample needs; arguments as in `step`."""
+        """Compile what nearly every sample needs; arguments as in `step`."""
         self.step(state, cv, cv)
+        if self.solver.narrow:
+            narrow = self.solver.relaxer(1)
+            _, (state, _, instances, _) = self._observe(narrow, state, cv, np.asarray(cv, dtype=np.float64))
+            narrow.compile(instances, state.warm)
 
     def step(
         self,
@@ -114,9 +120,7 @@ class MixedIntegerControllers:
         known = np.isfinite(np.asarray(cv)).all(axis=1)
         target = np.asarray(setpoint, dtype=np.float64)
         narrow = self.solver.relaxer(1)
-        state, free_response, ready = _observe(
-            self.memory, narrow.lanes, state, np.asarray(cv, dtype=np.float64), target
-        )
+        observed, (state, free_response, ready, root) = self._observe(narrow, state, cv, target)
 
         def instances_of(relaxer: Relaxer) -> QpInstance:
             if relaxer is narrow:
@@ -125,6 +129,7 @@ class MixedIntegerControllers:
 
         relaxer, instances, results, roots = self.solver.solve(
             instances_of,
+            root=None if root is None else relaxations(root, narrow.predictions),
             previous_moves=np.asarray(state.plan),
             warm=state.warm,
             gap=self.gap,
@@ -134,10 +139,11 @@ class MixedIntegerControllers:
         good = known & np.array([result.x is not None for result in results])
         none = np.zeros(instances.lower.shape[-1])
         x = np.stack([none if r.x is None else r.x for r in results])
-        fits = roots.warm.row_price.shape[-1] == state.warm.row_price.shape[-1]
-        warm = roots.warm if fits else state.warm
-        state, moves, recovering = _remember(self.memory, relaxer.lanes, instances, state, x, good, warm)
-        moves = np.asarray(moves)
+        if root is None:  # otherwise all that is remembered is there already
+            fits = roots.warm.row_price.shape[-1] == state.warm.row_price.shape[-1]
+            warm = roots.warm if fits else state.warm
+            observed = state, free_response, instances, Solved(warm, *([np.zeros(self.count)] * 4))
+        state, moves, recovering = self._remember(relaxer, observed, x, good)
         certified = lambda values: np.where(good, values, np.nan)  # noqa: E731
         value, bound = (np.array([getattr(r, key) for r in results]) for key in ("value", "bound"))
         scale = np.array([relaxer.scenario(i).scale for i in range(self.count)])
@@ -147,11 +153,11 @@ class MixedIntegerControllers:
         wall = time.perf_counter() - begin - (self.solver.compiling - compiled)
         values: dict[str, Any] = dict(  # on the host: NumPy where the compiled controller has JAX arrays
             move=moves[:, 0],
-            mv=np.asarray(state.mv),
+            mv=state.mv,
             moves=moves,
             status=np.where(known, [r.status for r in results], codes.FAILED),
             fallback=~good,
-            recovering=np.asarray(recovering),
+            recovering=recovering,
             objective=certified(value),
             bound=certified(bound),
             gap=certified(gap),
@@ -162,21 +168,66 @@ class MixedIntegerControllers:
         )
         return state, StepInfo(**values)
 
+    def _observe(self, narrow: Relaxer, state: ControllerState, cv, setpoint):
+        """`_observe` on the host: packed, and ``(state, free response, problems, relaxations or None)``."""
+        given = jax.tree.map(np.asarray, state), np.asarray(cv, dtype=np.float64), setpoint
+        qps, rows, columns = narrow.lanes, narrow.hard, narrow.columns
+        if not self.solver.narrow:
+            rows = columns = None
+        elif self.count <= LEAN:
+            qps = Lanes(qps.each, narrow.lean)
+        packings = self._packings.get(narrow)
+        if packings is None:
+            s = self.structure
+            free_response = jax.ShapeDtypeStruct((self.count, s.prediction_horizon, s.cv_count), jnp.float64)
+            instances = jax.eval_shape(_instances, self.memory, qps, given[0], free_response, setpoint)
+            root = None if rows is None else narrow.solved_shapes
+            packings = Packing.of(given), Packing.of((given[0], free_response, instances, root))
+            self._packings[narrow] = packings
+        observed = np.asarray(_observe(self.memory, qps, rows, columns, packings[0].pack(given), packings))
+        return observed, packings[1].unpack(observed)
+
+    def _remember(self, relaxer: Relaxer, observed, x, good):
+        """`_remember` on the host, for the problems of this relaxer."""
+        if isinstance(observed, np.ndarray):
+            of_observed = self._packings[relaxer][1]
+        else:
+            observed = jax.tree.map(np.asarray, observed)
+            of_observed = Packing.of(observed)
+            observed = of_observed.pack(observed)
+        packing = self._packings.get("remembered")
+        if packing is None:
+            state = of_observed.unpack(observed)[0]
+            recovering = jax.ShapeDtypeStruct((self.count,), jnp.bool)
+            packing = Packing.of((state, state.plan, recovering))
+            self._packings["remembered"] = packing
+        scales = Lanes(relaxer.lanes.each.scale, relaxer.lanes.shared.scale)
+        packings = of_observed, packing
+        return packing.unpack(np.asarray(_remember(self.memory, scales, observed, x, good, packings)))
+
 
 @jax.jit
 def _init(memory: Lanes[Memory], cv, mv, cold: WarmStart) -> ControllerState:
     return jax.vmap(lambda own, *args: eqx.combine(own, memory.shared).init(*args))(memory.each, cv, mv, cold)
 
 
-@jax.jit
-def _observe(memory: Lanes[Memory], qps: Lanes[CondensedQp], state: ControllerState, cv, setpoint):
-    """Bias and free response after a measurement, and the problems for moves of one step: ``"scenario"``."""
+@functools.partial(jax.jit, static_argnames="packings")
+def _observe(memory: Lanes[Memory], qps: Lanes[CondensedQp], rows, columns, given, packings):
+    """After a measurement, ``"scenario"``: bias and free response, the problems for moves of one step, their relaxations."""
+    state, cv, setpoint = packings[0].unpack(given)
 
     def lane(own, state, cv):
         return eqx.combine(own, memory.shared).observe(state, cv)
 
     state, free_response = jax.vmap(lane)(memory.each, state, cv)
-    return state, free_response, _instances(memory, qps, state, free_response, setpoint)
+    instances = _instances(memory, qps, state, free_response, setpoint)
+
+    def relaxed(own_qp, instance, start):
+        qp = eqx.combine(own_qp, qps.shared)
+        return relax(qp, rows, columns, instance, instance.lower, instance.upper, start)
+
+    root = None if rows is None else jax.vmap(relaxed)(qps.each, instances, state.warm)
+    return packings[1].pack((state, free_response, instances, root))
 
 
 @jax.jit
@@ -202,25 +253,28 @@ def _instances(
     return jax.vmap(lane)(memory.each, qps.each, state, free_response, setpoint)
 
 
-@jax.jit
-def _remember(
-    memory: Lanes[Memory], qps: Lanes[CondensedQp], instances, state: ControllerState, x, good, warm
-):
+@functools.partial(jax.jit, static_argnames="packings")
+def _remember(memory: Lanes[Memory], scales: Lanes, observed, x, good, packings):
     """Apply the first moves of the plans that there are: ``(state, planned moves, recovering)``."""
+    state, _, instances, root = packings[0].unpack(observed)
 
-    def lane(own, own_qp, instance, state, x, good, warm):
-        its, qp = eqx.combine(own, memory.shared), eqx.combine(own_qp, qps.shared)
-        planned = (x * qp.scale).reshape(its.structure.mv_count, -1).T
-        moves = jnp.where(good, planned.at[0].set(first_move(its.structure, qp, instance, planned[0])), 0.0)
+    def lane(own, own_scale, instance, state, x, good, warm):
+        its, scale = eqx.combine(own, memory.shared), eqx.combine(own_scale, scales.shared)
+        planned = (x * scale).reshape(its.structure.mv_count, -1).T
+        first = first_move(its.structure, scale, instance, planned[0])
+        moves = jnp.where(good, planned.at[0].set(first), 0.0)
         recovering = outside_limits(its.tuning, state.mv)
         warm = jax.tree.map(lambda new, old: jnp.where(good, new, old), warm, state.warm)
         return its.remember(state, moves[0], moves, warm), moves, recovering
 
-    return jax.vmap(lane)(memory.each, qps.each, instances, state, x, good, warm)
+    results = jax.vmap(lane)(memory.each, scales.each, instances, state, x, good, root.warm)
+    return packings[1].pack(results)
 
 
 class MixedIntegerController:
     """MPC with whole moves of the integer MVs (thesis chapter 6); runs on the host, solves exactly.
+
+    `together` is the same controller as a batch of one.
 
     Args:
         structure: static configuration with at least one integer MV.
@@ -241,7 +295,7 @@ class MixedIntegerController:
         time_limit: float | None = None,
         finish: str = "auto",
     ):
-        self._together = MixedIntegerControllers(
+        self.together = MixedIntegerControllers(
             structure, [tuning], [model], gap=gap, time_limit=time_limit, finish=finish
         )
         self.structure, self.tuning, self.model = structure, tuning, model
@@ -255,13 +309,13 @@ class MixedIntegerController:
     @property
     def memory(self) -> Memory:
         """Prediction and bookkeeping of this controller."""
-        return self._together.memory.lane(0)
+        return self.together.memory.lane(0)
 
     def init(self, cv, mv) -> ControllerState:
         """State at a steady state with measured CVs and present MVs (engineering units)."""
         check_vector("cv", cv, self.structure.cv_names, "CV unit")
         check_vector("mv", mv, self.structure.mv_names, "MV unit")
-        return _first(self._together.init(np.asarray(cv)[None], np.asarray(mv)[None]))
+        return _first(self.together.init(np.asarray(cv)[None], np.asarray(mv)[None]))
 
     def prepare(self, state: ControllerState, cv) -> None:
         """Compile what every sample needs; arguments as in `step`."""
@@ -270,7 +324,7 @@ class MixedIntegerController:
     def step(self, state: ControllerState, cv, setpoint) -> tuple[ControllerState, StepInfo]:
         """One sample; arguments as in `ContinuousController.step`."""
         lane = jax.tree.map(lambda leaf: np.asarray(leaf)[None], state)
-        together = self._together.step(lane, np.asarray(cv)[None], np.asarray(setpoint)[None])
+        together = self.together.step(lane, np.asarray(cv)[None], np.asarray(setpoint)[None])
         return _first(together)
 
 

@@ -21,6 +21,7 @@ from jaxmpc.relaxed_problem import RIDGE, TINY, Prepared, Prices, QpSolution, co
 
 STEPS = 20  # Newton steps after which a start is given up
 PENALTY = 1e4  # curvature of a proximal term against the largest of the Hessian
+FLAT_ROW = 1e-9  # squared length below which a row has next to no effect, against the longest
 SEARCHES = 12  # trials of the line search
 FLAT = 0.3  # share of its slope at the start that the merit may have where a line search ends
 
@@ -139,7 +140,8 @@ def refine(
         unless there is nothing left to do here.
     """
     p, keep, unit = problem, problem.keep, problem.unit
-    row_sigma = PENALTY / jnp.maximum((p.qp.response**2) @ p.qp.scale**2, TINY)
+    largest = jnp.max(p.qp.row_size)
+    row_sigma = PENALTY / jnp.maximum(p.qp.row_size, FLAT_ROW * jnp.where(largest > 0.0, largest, 1.0))
     hard_sigma = PENALTY / jnp.maximum(jnp.sum(p.w_matrix**2, axis=1), TINY)
     proximal = _Proximal(
         problem=p,
@@ -168,8 +170,8 @@ def refine(
         alpha = _search(along, gradient @ dx)
         x, t, w = x + alpha * dx, t + alpha * dt, w + alpha * dw
         prices = proximal.prices(x, t, w, state.prices)
-        size = jnp.max(jnp.abs(proximal.gradient(x, prices)))
-        settled, exact = size < 1e-7 * large, size < 1e-12 * large
+        left = jnp.max(jnp.abs(proximal.gradient(x, prices)))
+        settled, exact = left < 1e-7 * large, left < 1e-12 * large
         moved = jax.tree.map(lambda new, old: (new - old) ** 2, prices, state.prices)
         change = total(moved.row / row_sigma) + total(moved.box / PENALTY) + total(moved.hard / hard_sigma)
         good = jnp.all(jnp.isfinite(x))
@@ -179,7 +181,7 @@ def refine(
             prices=jax.tree.map(lambda new, old: jnp.where(settled, new, old), prices, state.prices),
             ridge=state.ridge,
             steps=state.steps + 1,
-            done=exact & (change < 1e-17),
+            done=exact & (change < 1e-14),
         )
         # a matrix that rounding left indefinite is tried again with more on its diagonal
         again = state._replace(ridge=1e2 * state.ridge, steps=state.steps + 1)

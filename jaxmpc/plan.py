@@ -22,7 +22,7 @@ from jaxmpc.newton import WarmStart
 from jaxmpc.relaxer import Constants, Relaxer
 from jaxmpc.search import SearchResult
 from jaxmpc.step_response import StepResponseModel, check_match
-from jaxmpc.step_solver import StepSolver, fitting
+from jaxmpc.step_solver import StepSolver
 from jaxmpc.structure import Structure, check_vector
 from jaxmpc.tuning import Tuning
 
@@ -162,7 +162,7 @@ class Planner:
         else:
             relaxer = self.solver.relaxer(1)
             instances = instances_of(relaxer)
-            result = self._solve_relaxed(relaxer, instances, fitting(start, relaxer, 1), gap)
+            result = self._solve_relaxed(relaxer, instances, relaxer.fitting(start, 1), gap)
         instance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], instances)
         return self._plan(relaxer.scenario(0), instance, result, mv_now, free_response, setpoint, gap, begin)
 

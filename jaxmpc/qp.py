@@ -158,7 +158,7 @@ def solve(
     # ---- start: slack rows exactly feasible, prices of eta and eps exactly dual feasible
     x = jnp.where(free, 0.5 * (jnp.clip(lower, -10.0, 10.0) + jnp.clip(upper, -10.0, 10.0)), fixed_value)
     t = p.respond(x) + offset
-    reach = jnp.sqrt((qp.response**2) @ qp.scale**2) + 1e-12
+    reach = jnp.sqrt(qp.row_size) + 1e-12
     eta = jnp.maximum(jnp.abs(t) - c, 0.0) + reach
     inner = jnp.stack([eta + c - t, eta + c + t, eta])
     share = (s2 * eta + s1) / jnp.sum(1.0 / inner, axis=0)

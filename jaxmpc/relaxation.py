@@ -1,8 +1,8 @@
 """A relaxed problem, solved to the end: Newton, and where that falls short the interior point and Newton again.
 
 This is what controllers and the integer search call; `qp` and `newton` are its two methods. Under `jax.vmap` a batch is
-not solved in lockstep: all lanes take Newton steps together until few are left, and these are
-gathered into small groups, so that finished lanes do not pay for hard ones.
+not solved in lockstep, where every lane would pay for the slowest: a few lanes at a time take Newton steps
+together, those that finish make room for others, and the interior point sees only the lanes that need it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jaxmpc.condense import PACKED_LIMIT, CondensedQp, QpInstance, packed_produc
 from jaxmpc.newton import WarmStart, refine, warm_start_of
 from jaxmpc.qp import solve
 from jaxmpc.relaxed_problem import QpSolution, prepare
-from jaxmpc.status import OPTIMAL
+from jaxmpc.status import FAILED, OPTIMAL
 
 ROUGH = 1e-9  # relative gap at which the interior point stops
 ENOUGH = 1e-7  # residual from which on a solution is not improved
@@ -60,15 +60,46 @@ def _solve(given, start: WarmStart) -> QpSolution:
 
 @_solve.def_vmap
 def _(size: int, batched, given, start):
-    given, own = _with_products(size, given, batched[0])
-    result = _solve_batch(size, given, own, start, batched[1])
+    result = _lanes_solver(size, *batched)(given, start)
     return result, jax.tree.map(lambda _: True, result)
 
 
-def _with_products(size: int, given, own):
+def _lanes_solver(size: int, own, own_start):
+    """`_solve_batch` for so many lanes; `own` and `own_start` are True for arrays with a batch axis."""
+    mine = own, own_start
+
+    @jax.custom_batching.custom_vmap
+    def solver(given, start):
+        return _solve_batch(size, given, own, start, own_start)
+
+    @solver.def_vmap
+    def _(outer: int, batched, given, start):
+        arguments, batched = (given, start), tuple(batched)
+        spread = lambda v, mapped: v if mapped else jnp.broadcast_to(v, (outer, *v.shape))  # noqa: E731
+        if batched[0][0].response and not own[0].response:  # one batch for each model
+            result = jax.lax.map(lambda a: solver(*a), jax.tree.map(spread, arguments, batched))
+            return result, jax.tree.map(lambda _: True, result)
+        # a batch of batches is one large batch
+        either = jax.tree.map(lambda mapped, one: mapped or one, batched, mine)
+
+        def merge(v, mapped, one, any_):
+            if not any_:
+                return v
+            v = spread(v, mapped) if one else jnp.repeat(v[:, None], size, axis=1)
+            return v.reshape(outer * size, *v.shape[2:])
+
+        given, start = jax.tree.map(merge, arguments, batched, mine, either)
+        result = _lanes_solver(outer * size, *either)(given, start)
+        result = jax.tree.map(lambda v: v.reshape(outer, size, *v.shape[1:]), result)
+        return result, jax.tree.map(lambda _: True, result)
+
+    return solver
+
+
+def _with_products(given, own):
     """The same problems with packed products where lanes share the responses; and what has a batch axis."""
     qp, shared = given[0], not own[0].response
-    if size <= WIDTH or qp.packed is not None or not shared or qp.response.shape[-1] > PACKED_LIMIT:
+    if qp.packed is not None or not shared or qp.response.shape[-1] > PACKED_LIMIT:
         return given, own
     put = lambda tree, packed: eqx.tree_at(lambda q: q.packed, tree, packed, is_leaf=lambda v: v is None)  # noqa: E731
     return (put(qp, packed_products(qp.response)), *given[1:]), (put(own[0], False), *own[1:])
@@ -106,13 +137,13 @@ def _unsolved(best: QpSolution) -> Bool[Array, ""]:
 def _nothing(qp: CondensedQp, rows, instance: QpInstance) -> QpSolution:
     """A solution that any other is better than."""
     hard, n, count = rows.shape[-2], qp.response.shape[-1], qp.response.shape[-2]
-    infinite, zero = jnp.asarray(jnp.inf), jnp.zeros((), dtype=jnp.int32)
+    infinite = jnp.asarray(np.inf)
     return QpSolution(
         x=jnp.zeros(n),
         objective=infinite,
         bound=-infinite,
-        status=zero - 1,
-        iterations=zero,
+        status=jnp.asarray(FAILED),
+        iterations=jnp.zeros((), dtype=jnp.int32),
         row_price=jnp.zeros(count),
         limit_price=jnp.zeros(instance.limit_high.shape[-1]),
         lower_price=jnp.zeros(n),
@@ -145,6 +176,7 @@ def _solve_batch(size: int, given, own, start: WarmStart, own_start) -> QpSoluti
     if size <= WIDTH:
         to_the_end = lambda given, start: _solve_lane(given, start, AXIS)  # noqa: E731
         return _lanes(to_the_end, (given, start), (own, own_start))
+    given, own = _with_products(given, own)
     start = jax.tree.map(
         lambda v, mine: v if mine else jnp.broadcast_to(v, (size, *v.shape)), start, own_start
     )

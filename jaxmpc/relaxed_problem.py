@@ -145,11 +145,10 @@ def prepare(
     offset, size = instance.offset, jnp.abs(qp.response)
     linear = 2.0 * ((qp.quadratic * offset) @ qp.response) * qp.scale
     beyond = jnp.maximum(jnp.abs(offset) - qp.deadzone, 0.0)
-    bent = 2.0 * (qp.soft_quadratic @ qp.response**2) * qp.scale**2  # curvature outside the deadzones
     steep = jnp.abs(linear) + ((qp.soft_linear + 2.0 * qp.soft_quadratic * beyond) @ size) * qp.scale
-    unit = jnp.maximum(jnp.max(jnp.diagonal(qp.curvature) + bent), 1e-2 * jnp.max(steep))
+    unit = jnp.maximum(jnp.max(jnp.diagonal(qp.curvature) + qp.bend), 1e-2 * jnp.max(steep))
     if qp.has_limits:
-        unit = jnp.maximum(unit, 1e-3 * jnp.max(qp.slack_weight * limit_reach(qp, instance)))
+        unit = jnp.maximum(unit, 1e-3 * jnp.max(qp.slack_weight * qp.reach))
     unit = jnp.where(unit > 0.0, unit, 1.0)
     free = (upper - lower) > FIXED
     # rows without free moves are constants and leave the solver; feasibility of the whole is checked outside
@@ -187,13 +186,6 @@ def substitute(factor: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Ar
     """Solution of the factorised system."""
     half = jax.lax.linalg.triangular_solve(factor, rhs[:, None], left_side=True, lower=True)
     return jax.lax.linalg.triangular_solve(factor, half, left_side=True, lower=True, transpose_a=True)[:, 0]
-
-
-def limit_reach(qp: CondensedQp, instance: QpInstance) -> Float[Array, " cv"]:
-    """What one unit of one move can do to a CV at most."""
-    size = jnp.abs(qp.response[: instance.limit_high.shape[0]])
-    largest = jnp.max(size.reshape(qp.slack_weight.shape[0], -1, size.shape[1]), axis=1)
-    return jnp.max(largest * qp.scale, axis=1)
 
 
 def evaluate(qp: CondensedQp, instance: QpInstance, x: Float[Array, " n"]) -> Float[Array, ""]:

@@ -7,8 +7,10 @@ the Newton matrices of all lanes are one matrix product; what differs is picked 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,11 +22,13 @@ from jaxmpc.blocking import hard_rows
 from jaxmpc.condense import CondensedQp, QpInstance, integer_columns
 from jaxmpc.levelset import assignment_order, leading_factor, root_factor, schur_complement
 from jaxmpc.newton import WarmStart, warm_start_of
+from jaxmpc.packing import Packing
 from jaxmpc.relaxation import cold_start, solve_relaxed
 from jaxmpc.relaxed_problem import evaluate
 from jaxmpc.structure import Structure
 
 SIZES = (1, 8, 64)  # lanes of a call, one compiled program each; a batch is padded to the least that holds it
+SINGLY = 3  # problems up to which calls of one lane are faster than a padded batch
 LEAN = 8  # lanes up to which the packed products are not worth streaming through the cache
 WIDE = 128  # variables from which problems are solved one by one
 ROW_ROUNDING = 1e-6  # slack of the hard rows of rounded moves, which are whole numbers themselves
@@ -40,6 +44,7 @@ class Constants:
         self.rows = hard_rows(structure)
         self.cold = jax.tree.map(np.asarray, cold_start(qp, len(self.rows)))
         self.integer = integer_columns(structure)
+        self.scales = np.asarray(qp.scale)  # MV units per unit of x
         hessian = np.asarray(qp.hessian)
         self.schur, self.radius = schur_complement(hessian, self.integer)
         self.root_factor = root_factor(self.schur)
@@ -89,27 +94,60 @@ class Relaxations:
         return Relaxations(**{k: jax.tree.map(lambda leaf: leaf[begin:end], v) for k, v in own.items()})
 
 
-@jax.jit
-def _relax(shared, own, rows, integer, instances, index, lower, upper, starts):
-    """Relaxations of lanes that belong to the scenarios `index`; returns only what a search reads."""
+class Solved(NamedTuple):
+    """What a search reads of one relaxed problem, or of a batch; see `Relaxations`."""
+
+    warm: WarmStart
+    objective: Any
+    bound: Any
+    snapped: Any
+    status: Any
+
+
+def relax(qp: CondensedQp, rows, integer, instance: QpInstance, lower, upper, start: WarmStart) -> Solved:
+    """Relax one problem within limits of the moves, and evaluate its moves with the integer ones rounded."""
+    s = solve_relaxed(qp, rows, instance, lower, upper, start)
+    snapped = s.x.at[integer].set(jnp.round(s.x[integer]))
+    w = rows @ snapped
+    fits = jnp.all((w <= instance.row_high + ROW_ROUNDING) & (w >= instance.row_low - ROW_ROUNDING))
+    fits &= jnp.all((snapped <= instance.upper + ROW_ROUNDING) & (snapped >= instance.lower - ROW_ROUNDING))
+    value = jnp.where(fits, evaluate(qp, instance, snapped), jnp.inf)
+    return Solved(warm_start_of(s), s.objective, s.bound, value, s.status)
+
+
+@functools.partial(jax.jit, static_argnames="packings")
+def _relax(shared, own, rows, integer, problems, index, lanes, packings):
+    """Relaxations of lanes that belong to the scenarios `index`; goes in and comes out packed."""
+    of_instances, of_lanes, of_solved = packings
     pick = lambda tree: jax.tree.map(lambda leaf: leaf[index], tree)  # noqa: E731
 
-    def lane(own, instance, low, high, start):
-        qp = eqx.combine(own, shared)
-        predictions = instance.limit_high.shape[0]
-        s = solve_relaxed(qp, rows, instance, low, high, start)
-        snapped = s.x.at[integer].set(jnp.round(s.x[integer]))
-        w = rows @ snapped
-        fits = jnp.all((w <= instance.row_high + ROW_ROUNDING) & (w >= instance.row_low - ROW_ROUNDING))
-        fits &= jnp.all(
-            (snapped <= instance.upper + ROW_ROUNDING) & (snapped >= instance.lower - ROW_ROUNDING)
-        )
-        value = jnp.where(fits, evaluate(qp, instance, snapped), jnp.inf)
-        envelope = s.row_price[predictions:]
-        slope = s.lower_price - s.upper_price
-        return s.x, s.objective, s.bound, s.status, value, slope, envelope, warm_start_of(s)
+    def lane(own, instance, given):
+        return relax(eqx.combine(own, shared), rows, integer, instance, *given)
 
-    return jax.vmap(lane)(pick(own), pick(instances), lower, upper, starts)
+    solved = jax.vmap(lane)(pick(own), of_instances.unpack(problems[index]), of_lanes.unpack(lanes))
+    return of_solved.pack(solved)
+
+
+def relaxations(solved: Solved, predictions: int) -> Relaxations:
+    """What came back from a compiled call, on the host.
+
+    Args:
+        solved: of a batch.
+        predictions: rows before those of the envelope.
+    """
+    x, row_price, box_price = (
+        np.asarray(v) for v in (solved.warm.x, solved.warm.row_price, solved.warm.box_price)
+    )
+    return Relaxations(
+        x=x,
+        objective=solved.objective,
+        bound=solved.bound,
+        status=solved.status,
+        snapped=solved.snapped,
+        gradient=-box_price,
+        envelope=row_price[:, predictions:],
+        warm=solved.warm,
+    )
 
 
 class Relaxer:
@@ -130,8 +168,16 @@ class Relaxer:
         self.hard, self.columns = jnp.asarray(self.rows), jnp.asarray(self.integer)
         self.one = len(constants) == 1
         self.compiling = 0.0  # seconds of first calls so far
-        n = first.qp.theta.shape[1]
+        rows, n = first.qp.response.shape
         self.sizes = SIZES if n <= WIDE else SIZES[:1]
+        self.predictions = rows - len(first.knot)
+        numbers: Any = lambda *shape: jax.ShapeDtypeStruct((1, *shape), jnp.float64)  # noqa: E731
+        start = WarmStart(numbers(n), numbers(rows), numbers(n), numbers(len(self.rows)))
+        self.of_lanes = Packing.of((numbers(n), numbers(n), start))
+        self.solved_shapes = Solved(
+            start, numbers(), numbers(), numbers(), jax.ShapeDtypeStruct((1,), jnp.int32)
+        )
+        self.of_solved = Packing.of(self.solved_shapes)
 
     def scenario(self, index: int) -> Constants:
         """Constants of a scenario."""
@@ -155,17 +201,44 @@ class Relaxer:
             starts: moves and prices to start from, ``"lane"``.
         """
         count, parts, begin = len(index), [], 0
+        of_instances = Packing.of(instances)
+        problems = of_instances.pack(jax.tree.map(np.asarray, instances))
+        lanes = self.of_lanes.pack((lower, upper, starts))
         while begin < count:
-            size = next((s for s in self.sizes if s >= count - begin), self.sizes[-1])
+            size = self._size(count - begin)
             pad = np.minimum(begin + np.arange(size), count - 1)
-            lanes = (index[pad], lower[pad], upper[pad], jax.tree.map(lambda leaf: leaf[pad], starts))  # noqa: B023
-            out = self._call(instances, *lanes)
+            solved = self._call(problems, index[pad], lanes[pad], of_instances)
             used = min(size, count - begin)
-            parts.append(jax.tree.map(lambda v, n=used: np.asarray(v)[:n], out))
+            parts.append(solved[:used])
             begin += used
-        if len(parts) == 1:
-            return Relaxations(*parts[0])
-        return Relaxations(*jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts))
+        return relaxations(
+            self.of_solved.unpack(parts[0] if len(parts) == 1 else np.concatenate(parts)), self.predictions
+        )
+
+    def compile(self, instances: QpInstance, warm: WarmStart) -> None:
+        """Compile what searches call: single problems and small batches, and large ones where there are many scenarios."""
+        lower, upper = np.asarray(instances.lower), np.asarray(instances.upper)
+        for size in [s for s in self.sizes if s <= max(LEAN, len(lower))]:
+            index = np.zeros(max(size, SINGLY + 1) if size > 1 else 1, dtype=int)
+            start = jax.tree.map(lambda leaf, i=index: np.asarray(leaf)[i], warm)
+            self.solve(instances, index, lower[index], upper[index], start)
+
+    def _size(self, count: int) -> int:
+        """Lanes of the next call; a few problems are solved one by one, they would pay for the padding."""
+        if count <= SINGLY:
+            return 1
+        return next((s for s in self.sizes if s >= count), self.sizes[-1])
+
+    def shared(self, lanes: int) -> CondensedQp:
+        """What all scenarios share, with the packed products only where so many lanes are worth them."""
+        return self.lean if lanes <= LEAN else self.lanes.shared
+
+    def fitting(self, warm: WarmStart | None, count: int) -> WarmStart:
+        """The starts if they have as many rows as the problems (wider integer ranges have more), else cold ones."""
+        cold = self.scenario(0).cold
+        if warm is not None and np.shape(warm.row_price)[-1] == len(cold.row_price):
+            return jax.tree.map(np.asarray, warm)
+        return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape)), cold)
 
     def solve_roots(self, instances: QpInstance, warm: WarmStart) -> Relaxations:
         """Relaxations of all scenarios themselves, within their own limits."""
@@ -173,14 +246,15 @@ class Relaxer:
         lower, upper = np.asarray(instances.lower), np.asarray(instances.upper)
         return self.solve(instances, index, lower, upper, jax.tree.map(np.asarray, warm))
 
-    def _call(self, instances, index, lower, upper, starts):
+    def _call(self, problems, index, lanes, of_instances: Packing) -> np.ndarray:
         """Call the relaxation; a first call compiles, which is not held against a time limit."""
-        shared = self.lean if len(index) <= LEAN else self.lanes.shared
-        arguments = (shared, self.lanes.each, self.hard, self.columns, instances, index, lower, upper, starts)
-        form = jax.tree.structure(arguments), tuple(np.shape(leaf) for leaf in jax.tree.leaves(arguments))
+        shared = self.shared(len(index))
+        packings = of_instances, self.of_lanes, self.of_solved
+        arguments = (shared, self.lanes.each, self.hard, self.columns, problems, index, lanes)
+        form = problems.shape, lanes.shape, packings, jax.tree.structure(arguments)
         if form not in _COMPILED:
             begin = time.perf_counter()
-            jax.block_until_ready(_relax(*arguments))
+            jax.block_until_ready(_relax(*arguments, packings=packings))
             _COMPILED.add(form)
             self.compiling += time.perf_counter() - begin
-        return _relax(*arguments)
+        return np.asarray(_relax(*arguments, packings=packings))

@@ -6,14 +6,14 @@ engineering units.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxmpc.condense import CondensedQp, QpInstance, condense, integer_columns
+from jaxmpc.condense import DRIFT, CondensedQp, QpInstance, condense, integer_columns
 from jaxmpc.errors import InputError
 from jaxmpc.integer import solve_integers
 from jaxmpc.newton import WarmStart
@@ -71,10 +71,18 @@ class StepSolver:
         """Seconds spent on first calls so far."""
         return sum(relaxer.compiling for relaxer in self._relaxers.values())
 
+    @functools.cached_property
+    def narrow(self) -> bool:
+        """Whether no integer MV ever moves more than one step: `relaxer(1)` has all constants that are needed."""
+        limits = np.array([[np.asarray(t.move_low), np.asarray(t.move_high)] for t in self.tunings])
+        steps = [(mv, step) for mv, step in enumerate(self.structure.integer_step) if step is not None]
+        return all((np.abs(limits[..., mv]) / step < 2.0 - DRIFT).all() for mv, step in steps)
+
     def solve(
         self,
         instances_of: InstancesOf,
         *,
+        root: Relaxations | None = None,
         previous_moves: Float[np.ndarray, "scenario block mv"] | None = None,
         warm: WarmStart | None = None,
         gap: float = 1e-6,
@@ -85,6 +93,7 @@ class StepSolver:
 
         Args:
             instances_of: makes the problems, with a scenario axis, for given constants.
+            root: the relaxations of `relaxer(1)` if they are known already; only where `narrow`.
             previous_moves: start, in engineering units, or None.
             warm: prices of neighbouring steps with a scenario axis; ignored where their size does not fit.
             gap: relative gap.
@@ -95,31 +104,36 @@ class StepSolver:
             ``(relaxer, problems, results, roots)``: what was solved, how it ended per scenario, and all root relaxations.
         """
         relaxer = self.relaxer(1)
-        integer = relaxer.integer
         instances = instances_of(relaxer)
+        if root is None:
+            relaxer, instances = self._reaching(relaxer, instances, instances_of)
+        integer, count = relaxer.integer, len(instances.lower)
+        starts: list[list[np.ndarray]] = [[] for _ in range(count)]
+        if previous_moves is not None:
+            for i, moves in enumerate(previous_moves):
+                wanted = moves.T.reshape(-1)[integer] / relaxer.scenario(i).scales[integer]
+                starts[i].append(np.clip(np.nan_to_num(wanted), -1e6, 1e6))
+        results, root = solve_integers(
+            relaxer,
+            instances,
+            starts=starts,
+            warm=warm,
+            root=root,
+            gap=gap,
+            time_limit=time_limit,
+            finish=finish,
+        )
+        return relaxer, instances, results, root
+
+    def _reaching(self, relaxer: Relaxer, instances: QpInstance, instances_of: InstancesOf):
+        """Constants with an envelope as wide as the integer ranges, and the problems for them, their limits finite."""
+        integer = relaxer.integer
         lower, upper = self._bounded(instances)
         envelope = int(max(np.abs(lower[:, integer]).max(), np.abs(upper[:, integer]).max()))
         if envelope > 1:
             relaxer = self.relaxer(envelope if envelope <= WIDEST_ENVELOPE else 0)
             instances = instances_of(relaxer)
-        instances = eqx.tree_at(lambda i: (i.lower, i.upper), instances, (lower, upper))
-        count = len(lower)
-        starts: list[list[np.ndarray]] = [[] for _ in range(count)]
-        if previous_moves is not None:
-            for i, moves in enumerate(previous_moves):
-                scale = np.asarray(relaxer.scenario(i).qp.scale)
-                wanted = moves.T.reshape(-1)[integer] / scale[integer]
-                starts[i].append(np.clip(np.nan_to_num(wanted), -1e6, 1e6))
-        results, roots = solve_integers(
-            relaxer,
-            instances,
-            starts=starts,
-            warm=fitting(warm, relaxer, count),
-            gap=gap,
-            time_limit=time_limit,
-            finish=finish,
-        )
-        return relaxer, instances, results, roots
+        return relaxer, eqx.tree_at(lambda i: (i.lower, i.upper), instances, (lower, upper))
 
     def _bounded(self, instances: QpInstance) -> tuple[np.ndarray, np.ndarray]:
         """Limits ``"scenario n"``, finite for integer moves that have none: the level set of a rounded plan."""
@@ -128,7 +142,7 @@ class StepSolver:
         if np.isfinite(lower[:, integer]).all() and np.isfinite(upper[:, integer]).all():
             return lower, upper
         relaxer = self.relaxer(0)
-        padded, start = _padded(instances, relaxer), fitting(None, relaxer, len(lower))
+        padded, start = _padded(instances, relaxer), relaxer.fitting(None, len(lower))
         root = relaxer.solve_roots(padded, start)
         center = root.x[:, integer]
         fixed_low, fixed_high = lower.copy(), upper.copy()
@@ -162,14 +176,6 @@ def _whole_near(structure: Structure, instances: QpInstance, i: int, wanted: np.
         if found is not None:
             return found
     return np.round(wanted)
-
-
-def fitting(warm: WarmStart | None, relaxer: Relaxer, count: int) -> WarmStart:
-    """The starts if they have as many rows as the problems (wider integer ranges have more), else cold ones."""
-    cold = relaxer.scenario(0).cold
-    if warm is not None and np.shape(warm.row_price)[-1] == len(cold.row_price):
-        return jax.tree.map(np.asarray, warm)
-    return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape)), cold)
 
 
 def _padded(instances: QpInstance, relaxer: Relaxer) -> QpInstance:

@@ -234,3 +234,28 @@ def test_a_bad_structure_names_the_field(changes, field):
     with pytest.raises(InputError) as error:
         structure(**changes)
     assert error.value.field == field
+
+
+def test_tunings_share_the_response_of_their_model():
+    """A vmap over tunings alone leaves what the Newton matrices are made of without a batch axis."""
+    s = structure()
+    coefficients = jnp.asarray(np.random.default_rng(7).normal(size=(2, 2, 9)))
+
+    def constants(weight, limit):
+        tuning = make_tuning(
+            s, cv_weight=[1.0, 2.0], move_weight=1.0, move_low=-4.0, move_high=4.0, mv_low=0.0, mv_high=9.0
+        )
+        tuning = dataclasses.replace(
+            tuning, cv_weight=weight * tuning.cv_weight, move_high=limit * tuning.move_high
+        )
+        qp = condense(s, tuning, coefficients)
+        return (qp.response, qp.packed), qp.scale, qp.theta
+
+    # `out_axes=None` is refused for anything that has a batch axis
+    over = jax.vmap(constants, in_axes=(0, 0), out_axes=(None, 0, 0))
+    (response, packed), scale, theta = over(jnp.asarray([1.0, 3.0]), jnp.asarray([1.0, 2.0]))
+    assert response.shape == (30 + 5, 10)
+    assert np.shape(packed) == (30 + 5, 55)
+    assert not np.allclose(scale[0], scale[1])
+    np.testing.assert_allclose(theta[1], response * scale[1], rtol=1e-15)
+    np.testing.assert_array_equal(theta[1][30:, :5], np.eye(5))

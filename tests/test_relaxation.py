@@ -11,7 +11,7 @@ from jaxmpc.blocking import hard_rows
 from jaxmpc.condense import condense, make_instance
 from jaxmpc.newton import WarmStart, refine, warm_start_of
 from jaxmpc.qp import solve
-from jaxmpc.relaxation import solve_relaxed
+from jaxmpc.relaxation import cold_start, solve_relaxed
 from jaxmpc.relaxed_problem import evaluate, prepare
 from jaxmpc.tuning import make_tuning
 
@@ -131,3 +131,132 @@ def test_crossed_limits_are_never_success(batch):
     instance = jax.tree.map(lambda v: v[0], instances)
     got = solve_relaxed(qp, rows, instance, instance.lower.at[2].set(0.5), instance.upper.at[2].set(-0.5))
     assert int(got.status) == status.FAILED
+
+
+MIXED = 40  # more lanes than go in lockstep
+NOT_A_NUMBER, CROSSED, CONFLICT, FIXED_MOVES = 3, 7, 11, 15  # lanes of `mixed` that are no ordinary problems
+
+
+@pytest.fixture(scope="module")
+def mixed(batch):
+    """Many lanes: easy ones, some at CV limits, and one of each kind that cannot be solved."""
+    structure, qp, rows, instances = batch
+    rng = np.random.default_rng(4)
+    lanes = jax.tree.map(lambda v: np.asarray(v)[rng.integers(LANES, size=MIXED)].copy(), instances)
+    lanes.offset[:] *= rng.uniform(0.5, 1.5, size=(MIXED, 1))
+    lanes.offset[NOT_A_NUMBER, 5] = np.nan
+    lanes.lower[CROSSED, 2], lanes.upper[CROSSED, 2] = 0.5, -0.5
+    lanes.row_low[CONFLICT, 1], lanes.row_high[CONFLICT, 1] = 50.0, 60.0
+    lanes.lower[FIXED_MOVES, :8] = lanes.upper[FIXED_MOVES, :8] = 0.0
+    return structure, qp, rows, jax.tree.map(jnp.asarray, lanes)
+
+
+@pytest.fixture(scope="module")
+def mixed_solved(mixed):
+    _, qp, rows, lanes = mixed
+    return jax.jit(jax.vmap(lambda i: solve_relaxed(qp, rows, i, i.lower, i.upper)))(lanes)
+
+
+def test_a_lane_of_a_large_batch_does_not_depend_on_its_neighbours(mixed, mixed_solved):
+    _, qp, rows, lanes = mixed
+    impossible = np.isin(np.arange(MIXED), [NOT_A_NUMBER, CROSSED, CONFLICT])
+    assert (np.asarray(mixed_solved.status) == np.where(impossible, status.FAILED, status.OPTIMAL)).all()
+    one = jax.jit(lambda i: solve_relaxed(qp, rows, i, i.lower, i.upper))
+    for k in range(MIXED):
+        alone = one(jax.tree.map(lambda v, k=k: v[k], lanes))
+        assert int(alone.status) == int(mixed_solved.status[k])
+        if not impossible[k]:
+            np.testing.assert_allclose(mixed_solved.objective[k], alone.objective, rtol=1e-6)
+    order = np.random.default_rng(5).permutation(MIXED)
+    run = jax.jit(jax.vmap(lambda i: solve_relaxed(qp, rows, i, i.lower, i.upper)))
+    shuffled = run(jax.tree.map(lambda v: v[order], lanes))
+    assert np.array_equal(shuffled.status, mixed_solved.status[order])
+    possible = ~impossible[order]
+    np.testing.assert_allclose(
+        shuffled.objective[possible], mixed_solved.objective[order][possible], rtol=1e-6
+    )
+
+
+def test_a_batch_of_batches_is_one_batch(mixed, mixed_solved):
+    _, qp, rows, lanes = mixed
+    fold = lambda tree: jax.tree.map(lambda v: v.reshape(2, MIXED // 2, *v.shape[1:]), tree)  # noqa: E731
+    solve_lane = lambda i: solve_relaxed(qp, rows, i, i.lower, i.upper)  # noqa: E731
+    nested = jax.jit(jax.vmap(jax.vmap(solve_lane)))(fold(lanes))
+    both = np.asarray(mixed_solved.status) == status.OPTIMAL
+    assert np.array_equal(np.asarray(nested.status).reshape(-1) == status.OPTIMAL, both)
+    np.testing.assert_allclose(nested.objective.reshape(-1)[both], mixed_solved.objective[both], rtol=1e-9)
+
+
+def test_lanes_may_have_their_own_limits_inside_a_batch_of_problems(mixed):
+    """Outer lanes are problems, inner lanes limits: what only one axis has must meet the right partner."""
+    _, qp, rows, lanes = mixed
+    few = jax.tree.map(lambda v: v[:2], lanes)
+    shares = jnp.linspace(0.2, 1.0, 3)
+    cut = lambda i, share: solve_relaxed(qp, rows, i, share * i.lower, share * i.upper).objective  # noqa: E731
+    table = jax.jit(jax.vmap(jax.vmap(cut, in_axes=(None, 0)), in_axes=(0, None)))(few, shares)
+    alone = jax.jit(cut)
+    for lane in range(2):
+        values = [alone(jax.tree.map(lambda v, k=lane: v[k], few), share) for share in shares]
+        np.testing.assert_allclose(table[lane], values, rtol=1e-7)
+
+
+def test_lanes_with_models_of_their_own_are_each_solved_with_its_model(batch, thesis_fields, well_like_model):
+    """Per-lane dynamic matrices: alone, and as a batch of models that each serve a batch of problems."""
+    structure, _, rows, instances = batch
+    tuning = make_tuning(structure, **thesis_fields)
+    gains = jnp.linspace(0.7, 1.3, 3)
+    few = jax.tree.map(lambda v: v[:2], instances)
+
+    def value(gain, instance):
+        qp = condense(structure, tuning, gain * well_like_model.coefficients, envelope=0, packed=False)
+        solution = solve_relaxed(qp, rows, instance, instance.lower, instance.upper)
+        return solution.objective, solution.status
+
+    inner = jax.vmap(value, in_axes=(None, 0))
+    table, codes = jax.jit(jax.vmap(inner, in_axes=(0, None)))(gains, few)
+    swapped, _ = jax.jit(jax.vmap(jax.vmap(value, in_axes=(0, None)), in_axes=(None, 0)))(gains, few)
+    assert (np.asarray(codes) == status.OPTIMAL).all()
+    np.testing.assert_allclose(swapped.T, table, rtol=1e-7)
+    alone = jax.jit(value)
+    values = [alone(gain, jax.tree.map(lambda v: v[1], few))[0] for gain in gains]
+    np.testing.assert_allclose(table[:, 1], values, rtol=1e-7)
+
+
+def test_a_warm_batch_inside_a_scan_takes_few_steps(batch):
+    _, qp, rows, instances = batch
+    lanes = jax.tree.map(lambda v: jnp.concatenate([v, v]), instances)
+
+    def sample(start, share):
+        run = lambda i, s: solve_relaxed(qp, rows, i, i.lower, i.upper, s)  # noqa: E731
+        solution = jax.vmap(run)(eqx.tree_at(lambda i: i.offset, lanes, share * lanes.offset), start)
+        return warm_start_of(solution), (solution.status, solution.iterations)
+
+    cold = cold_start(qp, len(rows))
+    start = jax.tree.map(lambda v: jnp.tile(v, (2 * LANES, 1)), cold)
+    _, (codes, steps) = jax.jit(lambda s: jax.lax.scan(sample, s, jnp.asarray([1.0, 1.0, 1.001])))(start)
+    assert (np.asarray(codes) == status.OPTIMAL).all()
+    assert np.median(steps[1:]) <= 2
+
+
+def test_rows_that_no_move_reaches_are_constants(small_structure, thesis_fields, well_like_model):
+    """Dead time, and a CV without any response: infinite penalties must not become not a number."""
+    structure = small_structure.relaxed()
+    coefficients = np.asarray(well_like_model.coefficients).copy()
+    coefficients[..., :5] = 0.0
+    coefficients[1] = 0.0
+    tuning = make_tuning(structure, **thesis_fields)
+    for model in (coefficients, np.zeros_like(coefficients)):
+        qp = condense(structure, tuning, jnp.asarray(model), envelope=0)
+        zero = jnp.zeros((40, 2))
+        instance = make_instance(
+            structure,
+            tuning,
+            qp,
+            free_response=zero + jnp.asarray([11000.0, 185.0]),
+            setpoint=zero + jnp.asarray([12500.0, 175.0]),
+            mv_now=jnp.asarray([50.0, 5000.0]),
+            last_move=jnp.zeros(2),
+        )
+        got = solve_relaxed(qp, hard_rows(structure), instance, instance.lower, instance.upper)
+        assert int(got.status) == status.OPTIMAL
+        assert int(got.iterations) < 15
