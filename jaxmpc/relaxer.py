@@ -29,7 +29,7 @@ from jaxmpc.structure import Structure
 
 SIZES = (1, 8, 64)  # lanes of a call, one compiled program each; a batch is padded to the least that holds it
 SINGLY = 3  # problems up to which calls of one lane are faster than a padded batch
-LEAN = 8  # lanes up to which the packed products are not worth streaming through the cache
+LEAN = 4  # lanes up to which the packed products are not worth streaming through the cache
 WIDE = 128  # variables from which problems are solved one by one
 ROW_ROUNDING = 1e-6  # slack of the hard rows of rounded moves, which are whole numbers themselves
 
