@@ -17,6 +17,7 @@ from typing import Any
 from jaxmpc.errors import InputError, MissingToolError
 
 EXIT_OPTIMAL, EXIT_OTHER, EXIT_BAD_INPUT, EXIT_INFEASIBLE, EXIT_LIMIT = 0, 1, 2, 3, 4
+EXIT_STOPPED = 130  # what shells report for Ctrl-C
 FINISHES = ("auto", "enumeration", "highs", "branch-and-bound")
 PLANTS = ("fmu", "jax")
 
@@ -29,7 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     Returns:
         The exit status: 0 done (for `plan`: optimal), 2 bad input with nothing written, 3 infeasible, 4 limit
-        reached with a feasible plan, 1 anything else.
+        reached with a feasible plan, 130 stopped by Ctrl-C, 1 anything else.
     """
     options = _parser().parse_args(arguments)
     try:
@@ -38,6 +39,9 @@ def main(arguments: list[str] | None = None) -> int:
         return _complain(error, EXIT_BAD_INPUT)
     except MissingToolError as error:
         return _complain(error, EXIT_OTHER)
+    except KeyboardInterrupt:
+        print("jaxmpc: stopped", file=sys.stderr)
+        return EXIT_STOPPED
     except BrokenPipeError:  # the reader of standard output has left
         sys.stderr.close()
         return EXIT_OTHER
@@ -126,20 +130,85 @@ def _parser() -> argparse.ArgumentParser:
         "--out", metavar="MODEL.json", type=Path, default=Path("model.json"), help="where to write"
     )
 
-    study = family("study", "Run studies.")
-    run = study.add_parser("run", help="Run a study.", description="Run a study.", allow_abbrev=False)
-    studies = run.add_subparsers(title="studies", metavar="STUDY", required=True)
-    thesis = command(
-        studies,
-        "thesis",
-        _study_thesis,
-        "Compare continuous and mixed-integer MPC on the well over 78,000 s and draw the figures.",
+    study = family("study", "Run studies, look at them, and export their results.")
+    run = command(
+        study,
+        "run",
+        _study_run,
+        "Run a study: the thesis comparison, a shipped sweep, or a sweep of your own from a TOML file.",
+        epilog="Shipped: thesis (three controllers over 78,000 s, with figures), deadzone, mismatch, blocking, robustness. "
+        "A run that is stopped goes on where it was when the same command is given again. "
+        "Exit status: 0 done, 2 bad input, 130 stopped by Ctrl-C, 1 anything else.",
     )
-    thesis.add_argument(
+    run.add_argument("study", metavar="STUDY", help="name of a shipped study, or a definition FILE.toml")
+    run.add_argument("--quick", action="store_true", help="the shortened version, one to two minutes")
+    run.add_argument(
         "--out", metavar="DIR", type=Path, default=Path("results"), help="where results and figures go"
     )
-    thesis.add_argument("--quick", action="store_true", help="a shortened reference, under two minutes")
-    thesis.add_argument("--plant", choices=PLANTS, default="fmu", help="drive the FMU or its JAX twin")
+    run.add_argument(
+        "--plant",
+        choices=PLANTS,
+        default=argparse.SUPPRESS,
+        help="thesis only: drive the FMU or its JAX twin (default: fmu)",
+    )
+    run.add_argument(
+        "--store",
+        metavar="PATH.zarr",
+        type=Path,
+        default=argparse.SUPPRESS,
+        help="sweeps only: the store (default: DIR/NAME.zarr)",
+    )
+    run.add_argument(
+        "--workers",
+        metavar="N",
+        type=int,
+        default=argparse.SUPPRESS,
+        help="sweeps only: processes (default: 1)",
+    )
+    run.add_argument(
+        "--dask",
+        metavar="ADDRESS",
+        default=argparse.SUPPRESS,
+        help="sweeps only: scheduler of a dask.distributed cluster, such as tcp://host:8786",
+    )
+    run.add_argument(
+        "--dry-run",
+        action="store_true",
+        default=argparse.SUPPRESS,
+        help="sweeps only: say how many scenarios, chunks, bytes and minutes, and stop",
+    )
+    run.add_argument(
+        "--yes",
+        action="store_true",
+        default=argparse.SUPPRESS,
+        help="sweeps only: run more scenarios than the confirmation limit of the study",
+    )
+    look = command(
+        study, "status", _study_status, "Say how far a sweep is, what is damaged, and what to do next."
+    )
+    look.add_argument("store", metavar="STORE", type=Path, help="the store of a sweep")
+    look.add_argument("--verify", action="store_true", help="read every file and compare checksums")
+    out = command(study, "export", _study_export, "Write the results of a sweep to one file for other tools.")
+    out.add_argument("store", metavar="STORE", type=Path, help="the store of a sweep")
+    out.add_argument("target", metavar="FILE", type=Path, nargs="?", default=None, help="where to write")
+    kinds = out.add_mutually_exclusive_group()
+    for kind, what in (
+        ("csv", "scenarios and key figures as text"),
+        ("parquet", "the same, binary; needs pyarrow"),
+        ("netcdf", "everything, trajectories included"),
+    ):
+        kinds.add_argument(
+            f"--{kind}", dest="kind", action="store_const", const=kind, default=None, help=what
+        )
+    out.add_argument("--overwrite", action="store_true", help="replace the file if it is there")
+
+    rerun = command(
+        commands, "simulate", _simulate, "Run one scenario of a stored sweep again, in full, and plot it."
+    )
+    rerun.add_argument("scenario", metavar="STORE#NUMBER", help="the store of a sweep and a scenario in it")
+    rerun.add_argument(
+        "--out", metavar="DIR", type=Path, default=Path("results"), help="where trajectory and figure go"
+    )
 
     bench = command(
         commands,
@@ -159,7 +228,15 @@ def _parser() -> argparse.ArgumentParser:
         "--only",
         metavar="SECTION[,SECTION]",
         default=argparse.SUPPRESS,
-        help="what to measure: relaxed, batch, exact, loop, growth, startup, gpu (default: all)",
+        help="what to measure: relaxed, batch, exact, loop, growth, startup, sweep, gpu (default: all)",
+    )
+    bench.add_argument(
+        "--sweep",
+        dest="only",
+        action="store_const",
+        const="sweep",
+        default=argparse.SUPPRESS,
+        help="what a study costs beside its closed loops: the same as --only sweep",
     )
     bench.add_argument(
         "--json",
@@ -275,15 +352,123 @@ def _identify(options: argparse.Namespace) -> int:
     return EXIT_OPTIMAL
 
 
-def _study_thesis(options: argparse.Namespace) -> int:
+SWEEP_OPTIONS = ("store", "workers", "dask", "dry_run", "yes")
+
+
+def _study_run(options: argparse.Namespace) -> int:
+    given = vars(options)
+    if options.study == "thesis":
+        for name in SWEEP_OPTIONS:
+            if name in given:
+                raise InputError(
+                    f"--{name.replace('_', '-')}", given[name], "a sweep study; thesis runs in one process"
+                )
+        return _study_thesis(options, given.get("plant", "fmu"))
+    if "plant" in given:
+        raise InputError("--plant", given["plant"], "the study thesis; sweeps run on the JAX well")
+    return _study_sweep(options, given)
+
+
+def _study_thesis(options: argparse.Namespace, plant) -> int:
     _check_writable("--out", options.out / "results")
     from studies.thesis import run_thesis
 
-    folder = run_thesis(options.out, options.quick, options.plant)
+    folder = run_thesis(options.out, options.quick, plant)
     from figures.thesis import draw_all
 
     draw_all(folder)
     print(f"Summary: {folder / 'summary.md'}, figures: {folder / 'figures'}")
+    return EXIT_OPTIMAL
+
+
+def _study_sweep(options: argparse.Namespace, given: dict[str, Any]) -> int:
+    from studies.sweep.scenarios import load_study
+
+    dry = "dry_run" in given
+    try:
+        study = load_study(options.study, quick=options.quick, confirmed=dry or "yes" in given)
+    except InputError as error:
+        if error.field != "study.confirmation_limit":
+            raise
+        hint = "Give --yes to run them all, --dry-run to see how long that takes"
+        raise InputError(error.field, error.value, error.expected, hint) from None
+    if dry:
+        print(study.describe())
+        return EXIT_OPTIMAL
+    from studies.sweep.runner import RunError, run_study
+    from studies.sweep.search_study import SearchStudy
+
+    store = given.get("store", options.out / f"{study.name}.zarr")
+    spread = {"workers": given.get("workers", 1), "dask": given.get("dask")}
+    try:
+        if isinstance(study, SearchStudy):
+            from studies.sweep.search import run_search
+
+            path = run_search(study, store, **spread)
+        else:
+            command = _command(options.study, options.quick, "yes" in given)
+            path = run_study(study, store, **spread, command=command)
+    except RunError as error:
+        return _complain(error, EXIT_OTHER)
+    from figures.sweep import draw_sweep
+
+    folder = path.with_name(f"{path.stem}-figures")
+    draw_sweep(path, folder)
+    print(f"Results: {path}, figures: {folder}")
+    print(f"Look at them with: jaxmpc study export {path} {path.stem}.csv")
+    return EXIT_OPTIMAL
+
+
+def _command(study: str, quick: bool, confirmed: bool) -> str:
+    """What follows ``jaxmpc study run`` to go on with a study, from any folder."""
+    import shlex
+
+    from studies.sweep.definition import shipped_studies
+
+    name = study if study in shipped_studies() else str(Path(study).resolve())
+    return shlex.quote(name) + quick * " --quick" + confirmed * " --yes"
+
+
+def _study_status(options: argparse.Namespace) -> int:
+    from studies.sweep.status import status
+
+    print(status(options.store, options.verify))
+    return EXIT_OPTIMAL
+
+
+def _study_export(options: argparse.Namespace) -> int:
+    from studies.sweep.export import export
+
+    suffix = {None: "csv", "netcdf": "nc"}.get(options.kind, options.kind)
+    target = options.target or Path(f"{options.store.stem}.{suffix}")
+    _check_writable("FILE", target)
+    print(export(options.store, target, options.kind, options.overwrite))
+    return EXIT_OPTIMAL
+
+
+def _simulate(options: argparse.Namespace) -> int:
+    store, mark, number = options.scenario.rpartition("#")
+    if not mark or not number.isdigit():
+        raise InputError(
+            "scenario", options.scenario, "a store and a number, such as results/deadzone.zarr#12"
+        )
+    _check_writable("--out", options.out / "run")
+    import warnings
+
+    from studies.sweep.rerun import rerun
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        again = rerun(Path(store), int(number))
+    for warning in caught:
+        print(f"jaxmpc: {warning.message}", file=sys.stderr)
+    folder = options.out / f"{Path(store).stem}-{int(number)}"
+    print(again.save(folder))
+    from figures.sweep import draw_run
+
+    look = {"kind": again.kind, "actuator": again.actuator}
+    for path in draw_run(again.trajectory, again.deadzone, folder, again.title, **look):
+        print(path)
     return EXIT_OPTIMAL
 
 

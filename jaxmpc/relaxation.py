@@ -23,7 +23,9 @@ from jaxmpc.status import FAILED, OPTIMAL
 
 ROUGH = 1e-9  # relative gap at which the interior point stops
 ENOUGH = 1e-7  # residual from which on a solution is not improved
-WIDTH = 4  # lanes of a batch that go in lockstep; wider ones wait for their slowest lane longer than they save
+WIDTH = (
+    4  # lanes of a batch that go in lockstep; wider ones wait for their slowest lane longer than they save
+)
 LEFT = 4  # they stop when one in so many is unfinished, and leave the room to others
 AXIS = "relaxed lane"
 

@@ -12,6 +12,7 @@ import functools
 import hashlib
 import importlib
 import importlib.metadata
+import importlib.util
 import json
 import os
 import platform
@@ -58,6 +59,15 @@ def source_hash(package: str) -> str:
         if name not in EDGE_MODULES:
             trees[name] = ast.dump(_without_docstrings(ast.parse(path.read_text())))
     return content_hash(trees)
+
+
+@functools.cache
+def module_hash(name: str) -> str:
+    """Hash of the statements of one module, found without importing it."""
+    found = importlib.util.find_spec(name)
+    if found is None or found.origin is None:
+        raise ModuleNotFoundError(name)
+    return content_hash(ast.dump(_without_docstrings(ast.parse(Path(found.origin).read_text()))))
 
 
 def _without_docstrings(tree: ast.Module) -> ast.Module:

@@ -23,7 +23,8 @@ DOORS = {
     "distributed": ("studies/",),
     "xarray": ("studies/", "figures/"),
     "zarr": ("studies/",),
-    "scipy": ("studies/bench/",),
+    "optuna": ("studies/sweep/search.py",),
+    "scipy": ("studies/bench/", "studies/sweep/axes.py"),
     **dict.fromkeys(
         ("piqp", "clarabel", "osqp", "daqp", "qpax", "pyscipopt", "gurobipy"), ("studies/bench/peers.py",)
     ),

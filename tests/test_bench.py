@@ -41,6 +41,7 @@ ROW_KEYS = {
     "p99_ms",
     "rate",
     "seconds",
+    "megabytes",
     "ratio",
     "ratio_to",
     "ratio_is_lower_bound",

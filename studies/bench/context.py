@@ -35,6 +35,10 @@ class Size:
         together, together_samples: of the mixed-integer closed loops advanced together.
         growth: of horizon [samples], blocks, CVs and MVs.
         startup_modes: blocking modes whose first call is measured.
+        sweep_chunks, sweep_samples: of the sweep whose overhead is measured.
+        sweep_stored: scenarios of the store that is opened.
+        sweep_scanned: chunks of the store that is resumed.
+        sweep_memory: chunks of the two sweeps whose memory is compared.
     """
 
     modes: tuple[Mode, ...] = MODES
@@ -58,6 +62,11 @@ class Size:
         ("MVs", (1, 2, 4, 8)),
     )
     startup_modes: tuple[Mode, ...] = MODES
+    sweep_chunks: int = 3
+    sweep_samples: int = 1200
+    sweep_stored: int = 10_000
+    sweep_scanned: int = 1000
+    sweep_memory: tuple[int, int] = (8, 80)
 
 
 FULL = Size()
@@ -77,6 +86,11 @@ QUICK = Size(
     together_reference=references.quick,
     growth=(("horizon", (60,)), ("blocks", (4,)), ("CVs", (4,)), ("MVs", (4,))),
     startup_modes=("moves",),
+    sweep_chunks=1,
+    sweep_samples=120,
+    sweep_stored=640,
+    sweep_scanned=50,
+    sweep_memory=(2, 6),
 )
 
 

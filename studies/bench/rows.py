@@ -17,6 +17,7 @@ COLUMNS = (
     "p99 ms",
     "rate /s",
     "total s",
+    "MB",
     "ratio",
     "worst error",
     "floor",
@@ -25,13 +26,14 @@ COLUMNS = (
 )
 FORMAT = 1
 
-Quantity = Literal["median_ms", "p99_ms", "rate", "ratio", "seconds"]
+Quantity = Literal["median_ms", "p99_ms", "rate", "ratio", "seconds", "megabytes"]
 _SHOWN = {
     "median_ms": "median {} ms",
     "p99_ms": "p99 {} ms",
     "rate": "{} /s",
     "ratio": "{}x",
     "seconds": "{} s",
+    "megabytes": "{} MB",
 }
 _LARGER_IS_BETTER = ("rate", "ratio")
 
@@ -73,6 +75,7 @@ class Row(msgspec.Struct, kw_only=True):
         median_ms, p99_ms: time per problem [ms].
         rate: problems per second.
         seconds: of the whole, where that is what matters [s].
+        megabytes: peak memory of the process [MB].
         ratio: how many times as fast as `ratio_to` on the problems that both were given.
         ratio_to: the peer.
         ratio_is_lower_bound: the peer was stopped at its time limit.
@@ -91,6 +94,7 @@ class Row(msgspec.Struct, kw_only=True):
     p99_ms: float | None = None
     rate: float | None = None
     seconds: float | None = None
+    megabytes: float | None = None
     ratio: float | None = None
     ratio_to: str | None = None
     ratio_is_lower_bound: bool = False
@@ -166,7 +170,7 @@ def table(report: Report) -> str:
     """The rows as aligned text with the machine above and the notes below."""
     lines = [cells(row) for row in report.rows]
     widths = [max(len(line[i]) for line in [COLUMNS, *lines]) for i in range(len(COLUMNS))]
-    left = (0, 8, 9, 10)  # text columns; the others hold numbers
+    left = (0, 9, 10, 11)  # text columns; the others hold numbers
 
     def shown(line: Sequence[str]) -> str:
         cut = [
@@ -220,7 +224,7 @@ def cells(row: Row) -> list[str]:
     return [
         row.name,
         tried,
-        *(number(value) for value in (row.median_ms, row.p99_ms, row.rate, row.seconds)),
+        *(number(value) for value in (row.median_ms, row.p99_ms, row.rate, row.seconds, row.megabytes)),
         ratio,
         error,
         ", ".join(_SHOWN[goal.quantity].format(number(goal.floor)) for goal in row.goals),

@@ -14,7 +14,7 @@ from jaxmpc.files import write_atomically
 from studies.bench.context import FULL, QUICK, Context, Size
 from studies.bench.peers import MIQP_PEERS, QP_PEERS, Peer
 from studies.bench.rows import Report, Row, table
-from studies.bench.sections import exact, growth, loops, relaxed, startup
+from studies.bench.sections import exact, growth, loops, relaxed, startup, sweeps
 from studies.fingerprint import versions
 
 Section = Callable[[Context], Iterator[Row]]
@@ -25,6 +25,7 @@ SECTIONS: dict[str, Section] = {
     "loop": loops.loops,
     "growth": growth.growth,
     "startup": startup.startup,
+    "sweep": sweeps.sweeps,
     "gpu": relaxed.devices,
 }
 

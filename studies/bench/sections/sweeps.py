@@ -1,0 +1,170 @@
+"""What a sweep study costs beside its closed loops: runner, store, opening results, resuming, memory."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxmpc.errors import InputError
+from studies.bench.context import Context
+from studies.bench.rows import Goal, Row
+from studies.sweep.chunk import stored_variables
+from studies.sweep.definition import StudyDefinition
+from studies.sweep.layout import Column, StoreLayout
+from studies.sweep.reading import chunk_facts, kpi_frame
+from studies.sweep.runner import run_study
+from studies.sweep.store import SweepStore
+
+CHUNK = 64
+SHARE = 0.05  # of the time of the closed loops that everything else may take
+GROWTH = 1.1  # of the peak memory when there are many times as many scenarios
+
+
+def sweeps(context: Context) -> Iterator[Row]:
+    """Rows of overhead, opening, resuming and memory."""
+    size = context.size
+    with tempfile.TemporaryDirectory(prefix="jaxmpc-bench-") as name:
+        folder = Path(name)
+        yield _overhead(context, folder, size.sweep_chunks, size.sweep_samples)
+        yield _opening(context, folder, size.sweep_stored)
+        yield _resuming(context, folder, size.sweep_scanned)
+        yield from _memory(context, folder, size.sweep_memory)
+
+
+def _overhead(context: Context, folder: Path, chunks: int, samples: int) -> Row:
+    context.say(f"{chunks} chunks of {CHUNK} continuous scenarios, {samples} samples, stored")
+    run_study(_study(1, samples), folder / "warm.zarr", progress=False, say=lambda _: None)
+    begin = time.perf_counter()
+    path = run_study(_study(chunks, samples), folder / "overhead.zarr", progress=False, say=lambda _: None)
+    elapsed = time.perf_counter() - begin
+    simulated = sum(facts["simulation_time"] for facts in chunk_facts(path).values())
+    frame = kpi_frame(path)
+    row = Row(name=f"sweep: all but the closed loops, {chunks} chunks of {CHUNK}", section="sweep")
+    row.instances, row.solved = len(frame), int(np.asarray(frame["complete"]).sum())
+    row.seconds = elapsed - simulated
+    row.goals = (Goal("seconds", SHARE * simulated),)
+    row.counts = row.solved == row.instances
+    row.note = (
+        f"runner, key figures and store in {elapsed:.1f} s, of which {simulated:.1f} s are closed loops: "
+        f"{100 * row.seconds / simulated:.1f} %; the floor is {100 * SHARE:.0f} %, compiled before"
+    )
+    return row
+
+
+def _opening(context: Context, folder: Path, count: int) -> Row:
+    context.say(f"key figures of {count} stored scenarios")
+    path = _made_up(folder / "opening.zarr", count)
+    begin = time.perf_counter()
+    frame = kpi_frame(path)
+    row = Row(name=f"sweep: key figures of {count} scenarios as a table", section="sweep")
+    row.seconds = time.perf_counter() - begin
+    row.instances, row.solved = count, int((np.asarray(frame["choke_travel"]) == np.arange(count)).sum())
+    row.counts = row.solved == count
+    row.goals = (Goal("seconds", 2.0),) if count >= 10_000 else ()
+    return row
+
+
+def _resuming(context: Context, folder: Path, chunks: int) -> Row:
+    context.say(f"what is missing of {chunks} chunks")
+    layout = _layout(chunks * 2, 2)
+    with SweepStore.begin(folder / "resuming.zarr", layout, say=lambda _: None) as store:
+        for i in range(chunks - 1):
+            store.commit(i, _fields(layout, i), {})
+        begin = time.perf_counter()
+        missing = store.pending()
+        seconds = time.perf_counter() - begin
+    row = Row(name=f"sweep: what is missing of {chunks} chunks", section="sweep", seconds=seconds)
+    row.counts = missing == [chunks - 1]
+    row.instances = chunks
+    row.goals = (Goal("seconds", 1.0),) if chunks >= 1000 else ()
+    return row
+
+
+def _memory(context: Context, folder: Path, chunks: tuple[int, int]) -> Iterator[Row]:
+    few = None
+    for count in chunks:
+        context.say(f"peak memory of {count * CHUNK} scenarios")
+        command = [sys.executable, "-m", __name__, str(count), str(folder / f"memory-{count}.zarr")]
+        done = subprocess.run(command, check=False, capture_output=True, text=True)
+        row = Row(name=f"sweep: peak memory of {count * CHUNK} scenarios", section="sweep")
+        row.instances = count * CHUNK
+        if done.returncode:
+            row.status, row.counts, row.note = "failed", False, " ".join(done.stderr.split())[-200:]
+        else:
+            row.megabytes = float(done.stdout.split()[-1])
+            row.goals = () if few is None else (Goal("megabytes", GROWTH * few),)
+            row.note = (
+                "continuous, 20 samples, a process of its own; more scenarios must not need a tenth more"
+            )
+            few = row.megabytes
+        yield row
+
+
+def _study(chunks: int, samples: int):
+    body = {
+        "study": {"name": "bench", "chunk_size": CHUNK, "confirmation_limit": 10**6},
+        "base": {"actuator": "step", "reference": "quick", "duration": 10.0 * samples},
+        "axes": [
+            {
+                "key": "tuning.move_weight.choke",
+                "range": {"from": 60.0, "to": 2000.0, "count": CHUNK * chunks, "scale": "log"},
+            }
+        ],
+    }
+    return StudyDefinition.from_dict(body).expand()
+
+
+def _layout(count: int, size: int) -> StoreLayout:
+    everyone = np.arange(count)
+    return StoreLayout(
+        name="made-up",
+        title="made-up",
+        study_hash="made-up",
+        chunk_size=size,
+        chunk_scenarios=tuple(everyone[i : i + size] for i in range(0, count, size)),
+        scenario_hashes=tuple(str(k) for k in everyone),
+        columns=(Column("seed", "seed", "1", everyone.astype(float)),),
+        variables=stored_variables(()),
+        coords={"cv": (["gas_rate", "oil_rate"], "", "CV"), "mv": (["choke", "gas_lift"], "", "MV")},
+        provenance={},
+    )
+
+
+def _fields(layout: StoreLayout, chunk: int) -> dict[str, Any]:
+    numbers = layout.chunk_scenarios[chunk].astype(float)
+    fields = {}
+    for variable in layout.variables:
+        shape = (len(numbers), *layout.shape(variable))
+        fields[variable.name] = np.broadcast_to(numbers.reshape(-1, *[1] * (len(shape) - 1)), shape).astype(
+            variable.dtype
+        )
+    return fields
+
+
+def _made_up(path: Path, count: int) -> Path:
+    layout = _layout(count, CHUNK)
+    with SweepStore.begin(path, layout, say=lambda _: None) as store:
+        for i in range(len(layout.chunk_scenarios)):
+            store.commit(i, _fields(layout, i), {})
+    return path
+
+
+def _peak_megabytes() -> float:
+    try:
+        import resource
+    except ImportError:
+        raise InputError("memory", sys.platform, "a system that reports the memory of a process") from None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+if __name__ == "__main__":  # one measurement of memory, in a process of its own
+    run_study(_study(int(sys.argv[1]), 20), Path(sys.argv[2]), progress=False, say=lambda _: None)
+    print(_peak_megabytes())

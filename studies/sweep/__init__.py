@@ -1,0 +1,1 @@
+"""Sweep studies: many tunings, wells and references from one definition, in one store."""

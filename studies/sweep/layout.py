@@ -1,0 +1,163 @@
+"""What the store of a sweep study has to know of the study: its columns, variables, axes and scenario hashes.
+
+The scenarios of chunk ``i`` lie on the slots ``i * chunk_size`` to ``(i + 1) * chunk_size - 1`` of the store, so
+one chunk of the study is one Zarr chunk of every variable; slots beyond the scenarios of a chunk are padding.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from jaxmpc.errors import InputError
+
+RESERVED = ("scenario", "slot", "scenario_hash", "commits")  # names that the store itself uses
+FLAG = "complete"  # the one variable that the store also knows
+
+
+@dataclass(frozen=True)
+class Column:
+    """One scenario coordinate: what differs between the scenarios.
+
+    Attributes:
+        key: full key of the definition, for example ``tuning.deadzone.gas_rate``.
+        label: in words, for tables and axes.
+        unit: ``"1"`` for a number without unit, ``""`` for text.
+        values: one per scenario, numbers or text.
+    """
+
+    key: str
+    label: str
+    unit: str
+    values: np.ndarray
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One result per scenario.
+
+    Attributes:
+        name: of the variable in the store.
+        long_name: in words.
+        unit: of the values.
+        dims: axes after ``scenario``, for example ``()``, ``("cv",)`` or ``("time", "cv")``.
+        dtype: of the stored values, for example ``"f8"``.
+        empty: value before it is computed.
+    """
+
+    name: str
+    long_name: str
+    unit: str
+    dims: tuple[str, ...] = ()
+    dtype: str = "f8"
+    empty: float | int = float("nan")
+
+
+@dataclass(frozen=True)
+class StoreLayout:
+    """The store of one study before anything is computed.
+
+    Attributes:
+        name: short name of the study.
+        title: one line about it.
+        study_hash: of everything that the results depend on.
+        chunk_size: slots per chunk.
+        chunk_scenarios: scenario numbers of each chunk, 1 to `chunk_size` of them.
+        scenario_hashes: content hash of each scenario, by scenario number.
+        columns: values by scenario number.
+        variables: the results. One may be called ``complete``: 1 where the scenario ran to its end.
+        coords: values, unit and long name of each axis; ``<axis>_unit`` holds the units along an axis.
+        provenance: JSON-like facts, one attribute each.
+    """
+
+    name: str
+    title: str
+    study_hash: str
+    chunk_size: int
+    chunk_scenarios: tuple[np.ndarray, ...]
+    scenario_hashes: tuple[str, ...]
+    columns: tuple[Column, ...]
+    variables: tuple[Variable, ...]
+    coords: dict[str, tuple[Any, str, str]]
+    provenance: dict[str, Any]
+
+    @cached_property
+    def schema(self) -> str:
+        """Hash of what the stored numbers mean: names, units, axes with their values, types."""
+        axes = {axis for variable in self.variables for axis in variable.dims}
+        return digest(
+            sorted(
+                [v.name, v.unit, list(v.dims), np.dtype(v.dtype).str, repr(v.empty)] for v in self.variables
+            ),
+            {axis: np.asarray(self.coords[axis][0]).tolist() for axis in sorted(axes)},
+        )
+
+    def hashes_of(self, chunk: int) -> list[str]:
+        """Scenario hashes of the lanes of a chunk."""
+        return [self.scenario_hashes[k] for k in self.chunk_scenarios[chunk]]
+
+    @cached_property
+    def contents(self) -> tuple[str, ...]:
+        """Content hash of every chunk."""
+        return tuple(content_hash(self.hashes_of(i), self.schema) for i in range(len(self.chunk_scenarios)))
+
+    @cached_property
+    def identity(self) -> str:
+        """Hash of the study and of how it is cut into chunks: a store with another one is another store."""
+        return digest(
+            self.study_hash, self.chunk_size, [list(map(int, c)) for c in self.chunk_scenarios], self.contents
+        )
+
+    def shape(self, variable: Variable) -> tuple[int, ...]:
+        """Sizes of the axes of a variable after the scenario."""
+        return tuple(len(self.coords[axis][0]) for axis in variable.dims)
+
+    def check(self) -> None:
+        """Refuse a layout that cannot be stored.
+
+        Raises:
+            InputError: naming the field.
+        """
+        count = len(self.scenario_hashes)
+        numbers = [int(k) for chunk in self.chunk_scenarios for k in chunk]
+        if sorted(numbers) != list(range(count)):
+            raise InputError(
+                "chunk_scenarios", f"{len(numbers)} numbers", f"each of the {count} scenarios exactly once"
+            )
+        for i, chunk in enumerate(self.chunk_scenarios):
+            if not 1 <= len(chunk) <= self.chunk_size:
+                raise InputError(f"chunk_scenarios[{i}]", len(chunk), f"1 to {self.chunk_size} scenarios")
+        names = [column.key for column in self.columns] + [v.name for v in self.variables] + list(self.coords)
+        for name in names:
+            if not name or "/" in name or name.startswith((".", "__")) or name in RESERVED:
+                raise InputError(
+                    "variables", name, f"a name without '/' and other than {', '.join(RESERVED)}"
+                )
+            if names.count(name) > 1 or (name == FLAG and name not in [v.name for v in self.variables]):
+                raise InputError("variables", name, "a name that no other column, variable or axis has")
+        for column in self.columns:
+            if np.shape(column.values) != (count,):
+                raise InputError(
+                    column.key, np.shape(column.values), f"one value for each of {count} scenarios"
+                )
+        for variable in self.variables:
+            for axis in variable.dims:
+                if axis not in self.coords:
+                    raise InputError(
+                        f"{variable.name}.dims", axis, f"one of the axes {', '.join(self.coords)}"
+                    )
+
+
+def digest(*parts: Any) -> str:
+    """SHA-256 of JSON-like parts."""
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def content_hash(scenario_hashes: list[str], schema: str) -> str:
+    """Hash of a chunk: which scenarios, in which order, and what is stored of them."""
+    return digest(scenario_hashes, schema)

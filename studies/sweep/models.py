@@ -1,0 +1,55 @@
+"""Step-response models of a sweep study: identified on the nominal well, each working point once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import jax
+
+from identify.step_test import identify_step_response
+from jaxmpc.errors import InputError
+from jaxmpc.plant import check_inputs, steady_state
+from jaxmpc.step_response import StepResponseModel
+
+Point = tuple[float, float]
+STEPS = (2.0, 100.0)  # of the choke [%] and of the gas lift [m3/h]
+SAMPLES = 250  # coefficients of a model
+
+_steady_state = jax.jit(steady_state)
+
+
+def identify_models(
+    points: Iterable[Point], samples: int = SAMPLES, *, progress: Callable[[int, int], None] | None = None
+) -> dict[Point, StepResponseModel]:
+    """Step-response models of the shipped well at some working points.
+
+    Args:
+        points: ``(choke [%], gas lift [m3/h])``; repeats are identified once.
+        samples: number of coefficients N.
+        progress: called with ``(done, total)`` models.
+
+    Returns:
+        Models by working point, in the order of first appearance.
+
+    Raises:
+        InputError: naming the working point, for one outside its range (the step test goes 2 % and 100 m3/h further) or
+            without a steady state; before any model is identified.
+    """
+    wanted = list(dict.fromkeys((float(choke), float(lift)) for choke, lift in points))
+    for choke, lift in wanted:
+        here = f"model.choke = {choke:g} %, model.lift = {lift:g} m3/h"
+        try:
+            check_inputs(choke, lift)
+            check_inputs(choke + STEPS[0], lift + STEPS[1])
+        except InputError as error:
+            raise InputError(
+                here, error.value, f"{error.expected}, also {STEPS[0]:g} % and {STEPS[1]:g} m3/h further"
+            ) from None
+        if not bool(_steady_state(choke, lift).converged):
+            raise InputError(here, "no steady state", "a working point at which the well settles")
+    out = {}
+    for choke, lift in wanted:
+        out[choke, lift] = identify_step_response(None, choke, lift, STEPS, samples)
+        if progress is not None:
+            progress(len(out), len(wanted))
+    return out

@@ -1,0 +1,118 @@
+"""How far a sweep study is: what its store holds, what is damaged, how fast it went, and what to do next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import zarr
+
+from studies.sweep.layout import FLAG
+from studies.sweep.reading import read_small
+from studies.sweep.records import open_manifest, survey
+from studies.sweep.store import held
+
+
+@dataclass(frozen=True)
+class StudyStatus:
+    """The state of a store at one moment; printed, it reads as a few lines.
+
+    Attributes:
+        store: path of the store.
+        title: of the study.
+        chunks_done: stored chunks.
+        chunks_total: chunks of the study.
+        scenarios_done: scenarios in stored chunks.
+        scenarios_total: scenarios of the study.
+        failed: scenarios in stored chunks that did not run to their end (``complete`` 0).
+        bytes: size of the files of the study [B].
+        damaged: damaged files with what is wrong; their chunks are not among the stored ones.
+        rate: scenarios per second of one worker, from the recorded wall times; NaN without any.
+        running: whether a run writes the store right now.
+        definition: file that the study was run from, as far as its provenance says.
+    """
+
+    store: Path
+    title: str
+    chunks_done: int
+    chunks_total: int
+    scenarios_done: int
+    scenarios_total: int
+    failed: int
+    bytes: int
+    damaged: tuple[str, ...]
+    rate: float
+    running: bool
+    definition: str = "STUDY.toml"
+
+    def __str__(self) -> str:
+        share = self.scenarios_done / self.scenarios_total
+        lines = [
+            f"{self.title}: {self.scenarios_done} of {self.scenarios_total} scenarios ({share:.0%}), "
+            f"{self.chunks_done} of {self.chunks_total} chunks, {self.bytes / 1e6:.1f} MB in {self.store}"
+        ]
+        if self.failed:
+            lines.append(f"{self.failed} scenarios did not run to their end (complete = 0).")
+        if np.isfinite(self.rate):
+            rest = (self.scenarios_total - self.scenarios_done) / self.rate
+            left = f"; one worker needs {_duration(rest)} for the rest" if rest else ""
+            lines.append(f"One worker computes {self.rate:.3g} scenarios per second{left}.")
+        lines += [f"Damaged: {name}" for name in self.damaged]
+        again = f"jaxmpc study run {self.definition} --store {self.store}"
+        if self.running:
+            lines.append("A run is writing it now.")
+        elif self.damaged:
+            lines.append(f"To compute what is damaged or missing again:\n  {again}")
+        elif self.chunks_done < self.chunks_total:
+            lines.append(f"To continue:\n  {again}")
+        else:
+            lines.append("Complete. To compute what a changed definition adds, and nothing else:\n  " + again)
+        return "\n".join(lines)
+
+
+def status(path: str | Path, verify: bool = False) -> StudyStatus:
+    """Look at a store without changing it.
+
+    Args:
+        path: of the store, ending in ``.zarr``, or of the folder that holds it as ``study.zarr``.
+        verify: read every file and compare checksums; without it trajectories are only looked at for their size.
+
+    Raises:
+        InputError: if there is no store or its fixed files are damaged.
+    """
+    store, manifest = open_manifest(path)
+    root = zarr.open_group(str(store), mode="r")
+    found = survey(store, manifest["contents"], deep=verify)
+    tables = read_small(store, found, {name: root[name] for name in manifest["variables"]})
+    counts, size = manifest["chunk_counts"], manifest["chunk_size"]
+    failed, work, computed = 0, 0.0, 0
+    for chunk, record in found.records.items():
+        if FLAG in tables:
+            failed += int((tables[FLAG][chunk * size : chunk * size + counts[chunk]] <= 0).sum())
+        if "wall_time" in record["facts"]:
+            work += float(record["facts"]["wall_time"])
+            computed += counts[chunk]
+    files = [manifest["files"], *(record["files"] for record in found.records.values())]
+    return StudyStatus(
+        store=store,
+        title=manifest["title"] or manifest["name"],
+        chunks_done=len(found.records),
+        chunks_total=len(counts),
+        scenarios_done=sum(counts[i] for i in found.records),
+        scenarios_total=sum(counts),
+        failed=failed,
+        bytes=sum(length for group in files for length, _ in group.values()),
+        damaged=tuple(found.damage),
+        rate=computed / work if work > 0 else float("nan"),
+        running=held(store),
+        definition=str(root.attrs.get("definition_file", "STUDY.toml")),
+    )
+
+
+def _duration(seconds: float) -> str:
+    """A time that a person reads."""
+    for unit, length in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.1f} {unit}"
+    return f"{seconds:.0f} s"
