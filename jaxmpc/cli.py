@@ -141,7 +141,7 @@ def _parser() -> argparse.ArgumentParser:
         "Exit status: 0 done, 2 bad input, 130 stopped by Ctrl-C, 1 anything else.",
     )
     run.add_argument("study", metavar="STUDY", help="name of a shipped study, or a definition FILE.toml")
-    run.add_argument("--quick", action="store_true", help="the shortened version, one to two minutes")
+    run.add_argument("--quick", action="store_true", help="the shortened version, one to three minutes")
     run.add_argument(
         "--out", metavar="DIR", type=Path, default=Path("results"), help="where results and figures go"
     )
