@@ -136,7 +136,8 @@ def _parser() -> argparse.ArgumentParser:
         "run",
         _study_run,
         "Run a study: the thesis comparison, a shipped sweep, or a sweep of your own from a TOML file.",
-        epilog="Shipped: thesis (three controllers over 78,000 s, with figures), deadzone, mismatch, blocking, robustness. "
+        epilog="Shipped: thesis (three controllers over 78,000 s, with figures), deadzone, mismatch, blocking, robustness, "
+        "tune (a search). "
         "A run that is stopped goes on where it was when the same command is given again. "
         "Exit status: 0 done, 2 bad input, 130 stopped by Ctrl-C, 1 anything else.",
     )
@@ -401,12 +402,12 @@ def _study_sweep(options: argparse.Namespace, given: dict[str, Any]) -> int:
     store = given.get("store", options.out / f"{study.name}.zarr")
     spread = {"workers": given.get("workers", 1), "dask": given.get("dask")}
     try:
+        command = _command(options.study, options.quick, "yes" in given)
         if isinstance(study, SearchStudy):
             from studies.sweep.search import run_search
 
-            path = run_search(study, store, **spread)
+            path = run_search(study, store, **spread, command=command)
         else:
-            command = _command(options.study, options.quick, "yes" in given)
             path = run_study(study, store, **spread, command=command)
     except RunError as error:
         return _complain(error, EXIT_OTHER)

@@ -21,6 +21,7 @@ from studies.sweep.definition import StudyDefinition
 from studies.sweep.models import identify_models
 from studies.sweep.reading import open_study
 from studies.sweep.scenarios import Study
+from studies.sweep.search_study import SearchStudy
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -75,9 +76,9 @@ def study_of(store: Path) -> Study:
         quick = provenance(data, "quick")
     if not isinstance(body, dict):
         raise InputError("store", str(store), "a store of a sweep study, with its definition")
-    return StudyDefinition.from_dict(from_strict_json(body), folder or ".").expand(
-        quick=bool(quick), confirmed=True
-    )
+    definition = StudyDefinition.from_dict(from_strict_json(body), folder or ".")
+    made = definition.expand(quick=bool(quick), confirmed=True)
+    return made.evaluated(store) if isinstance(made, SearchStudy) else made
 
 
 def rerun(store: Path, number: int) -> Rerun:

@@ -47,6 +47,7 @@ def run_search(
     dask: str | None = None,
     progress: bool = True,
     say: Say = print,
+    command: str | None = None,
 ) -> Path:
     """Ask, run and store every batch of a search that is missing; `objectives.front` gives what it found.
 
@@ -60,6 +61,7 @@ def run_search(
         dask: only None, for the same reason.
         progress: whether to show a bar with rate and time left.
         say: receives a line per event.
+        command: words after ``jaxmpc study run`` that give this study, for `status`.
 
     Returns:
         Path of the store.
@@ -75,7 +77,7 @@ def run_search(
     if dask is not None:
         raise InputError("dask", dask, "nothing: a search runs in this process", hint)
     sampler = _Sampler(study)
-    with SweepStore.begin(store, study.layout(), say) as writer:
+    with SweepStore.begin(store, study.layout(command), say) as writer:
         missing = set(writer.pending())
         done = study.batches - len(missing)
         if done:

@@ -51,12 +51,12 @@ class SearchDescription(Description):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EvaluatedStudy(Study):
-    """The stored scenarios of a search as an ordinary study; the hashes are those of the store."""
+    """The stored scenarios of a search as an ordinary study; the hashes are those of the search."""
 
     planned: tuple[str, ...] = ()
 
     def scenario_hash(self, k: int) -> str:
-        """As stored: of the search, not of the numbers of scenario k."""
+        """As `SearchStudy.scenario_hash`, which is what the store holds."""
         return self.planned[k]
 
 
@@ -176,9 +176,13 @@ class SearchStudy:
             seconds=MODEL_SECONDS * models + COMPILE_SECONDS + samples / RATES[group.kind],
         )
 
-    def layout(self) -> StoreLayout:
-        """What the store has to know: every tuned value is a variable, as it is known only with the results."""
-        base, tuned, size = study_layout(self.probe), {}, self.chunk_size
+    def layout(self, command: str | None = None) -> StoreLayout:
+        """What the store has to know: every tuned value is a variable, as it is known only with the results.
+
+        Args:
+            command: as for `chunk.study_layout`.
+        """
+        base, tuned, size = study_layout(self.probe, command), {}, self.chunk_size
         variables = []
         labels = {column.key: column.label for column in self.probe.columns}
         for parameter in self.parameters:
@@ -226,11 +230,10 @@ class SearchStudy:
         rows = slice(0, done * self.chunk_size)
         with open_study(store) as data:
             columns = [[_plain(f, data[f.key].values[rows]) for f in p.fields] for p in self.parameters]
-            hashes = tuple(data.scenario_hash.values[rows].tolist())
         points = list(zip(*(list(zip(*keys, strict=True)) for keys in columns), strict=True))
         study = self.batch(points)
         inherited = {f.name: getattr(study, f.name) for f in dataclasses.fields(study)}
-        return EvaluatedStudy(**inherited, planned=hashes)
+        return EvaluatedStudy(**inherited, planned=tuple(self.scenario_hash(k) for k in range(rows.stop)))
 
 
 def expand_search(definition: StudyDefinition, *, confirmed: bool = False) -> SearchStudy:
