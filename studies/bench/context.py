@@ -62,8 +62,8 @@ class Size:
         ("MVs", (1, 2, 4, 8)),
     )
     startup_modes: tuple[Mode, ...] = MODES
-    sweep_chunks: int = 3
-    sweep_samples: int = 1200
+    sweep_chunks: int = 2
+    sweep_samples: int = 600
     sweep_stored: int = 10_000
     sweep_scanned: int = 1000
     sweep_memory: tuple[int, int] = (8, 80)
