@@ -26,7 +26,7 @@ from jaxmpc.integer import FINISHES
 from jaxmpc.newton import WarmStart
 from jaxmpc.packing import Packing
 from jaxmpc.plan import Planner
-from jaxmpc.relaxer import LEAN, Relaxer, Solved, relax, relaxations
+from jaxmpc.relaxer import Relaxer, Solved, relax, relaxations
 from jaxmpc.step_response import StepResponseModel, check_match
 from jaxmpc.step_solver import StepSolver
 from jaxmpc.structure import Structure, check_vector
@@ -171,11 +171,10 @@ class MixedIntegerControllers:
     def _observe(self, narrow: Relaxer, state: ControllerState, cv, setpoint):
         """`_observe` on the host: packed, and ``(state, free response, problems, relaxations or None)``."""
         given = jax.tree.map(np.asarray, state), np.asarray(cv, dtype=np.float64), setpoint
-        qps, rows, columns = narrow.lanes, narrow.hard, narrow.columns
-        if not self.solver.narrow:
-            rows = columns = None
-        elif self.count <= LEAN:
-            qps = Lanes(qps.each, narrow.lean)
+        qps, rows, columns = narrow.lanes, None, None
+        if self.solver.narrow:
+            qps = Lanes(qps.each, narrow.shared(self.count))
+            rows, columns = narrow.hard, narrow.columns
         packings = self._packings.get(narrow)
         if packings is None:
             s = self.structure

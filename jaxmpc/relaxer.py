@@ -218,8 +218,8 @@ class Relaxer:
     def compile(self, instances: QpInstance, warm: WarmStart) -> None:
         """Compile what searches call: single problems and small batches, and large ones where there are many scenarios."""
         lower, upper = np.asarray(instances.lower), np.asarray(instances.upper)
-        for size in [s for s in self.sizes if s <= max(LEAN, len(lower))]:
-            index = np.zeros(max(size, SINGLY + 1) if size > 1 else 1, dtype=int)
+        for size in [s for s in self.sizes if s <= max(SIZES[1], len(lower))]:
+            index = np.zeros(size, dtype=int)
             start = jax.tree.map(lambda leaf, i=index: np.asarray(leaf)[i], warm)
             self.solve(instances, index, lower[index], upper[index], start)
 

@@ -120,13 +120,14 @@ def run_scenarios(
     filled = [*scenarios, *([scenarios[-1]] * (lanes - len(scenarios)))]
     first = filled[0]
     tunings = [s.tuning for s in filled]
+    stacked = stack_tunings(tunings)
     model = [models[first.model_point]] if shared_model else [models[s.model_point] for s in filled]
     controllers: Any
     if first.kind == "mixed-integer":
         controllers = MixedIntegerControllers(first.structure, tunings, model, count=lanes)
     else:
         shared = model[0] if shared_model else model
-        controllers = controller_batch(first.structure, stack_tunings(tunings), shared)
+        controllers = controller_batch(first.structure, stacked, shared)
     references = [s.reference for s in filled]
     disturbed = any(s.disturbance is not None for s in filled)
     noisy = any(s.noise is not None for s in filled)
@@ -148,7 +149,7 @@ def run_scenarios(
     (batch,) = batches
     simulated = time.perf_counter()
     windows = np.stack([s.reference.window(s.structure.dt, s.samples) for s in filled])
-    figures = batch_kpis(batch, stack_tunings(tunings), windows, tolerance=np.array(SETTLED))
+    figures = batch_kpis(batch, stacked, windows, tolerance=np.array(SETTLED))
     fields = {name: values[: len(scenarios)] for name, values in figures.items()}
     fields[FLAG] = fields["finite"].astype("i1")
     for field in trajectories:

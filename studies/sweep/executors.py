@@ -19,9 +19,8 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Protocol
 
 from jaxmpc.errors import InputError, MissingToolError
-from studies import fingerprint
 from studies.sweep.chunk import ChunkResult, PreparedStudy, run_chunk
-from studies.sweep.scenarios import COMPUTING
+from studies.sweep.scenarios import code_hash
 
 AHEAD = 2  # chunks handed out per worker, so that none waits for the store
 CONNECT_SECONDS = 8.0  # to reach a scheduler
@@ -200,7 +199,7 @@ def disconnect(client: Any) -> None:
 
 def _hold(prepared: PreparedStudy, code: str) -> PreparedStudy:
     """On a worker: what all its chunks share; as a task it is computed again wherever it is lost."""
-    if _code() != code:
+    if code_hash() != code:
         raise RuntimeError(
             "a worker of the cluster has other code of jaxmpc or studies than this process; install the same "
             "version on all of them"
@@ -208,18 +207,12 @@ def _hold(prepared: PreparedStudy, code: str) -> PreparedStudy:
     return prepared
 
 
-def _code() -> str:
-    packages = [fingerprint.source_hash(package) for package in ("jaxmpc", "identify")]
-    modules = [fingerprint.module_hash(f"studies.{name}") for name in COMPUTING]
-    return fingerprint.content_hash(packages, modules)
-
-
 class Cluster:
     """A `dask.distributed` cluster; its scheduler computes a chunk elsewhere when a worker dies."""
 
     def __init__(self, prepared: PreparedStudy, client: Any, say: Callable[[str], None]):
         self.client, self.address = client, client.scheduler.address
-        self.prepared = client.submit(_hold, prepared, _code(), pure=False)
+        self.prepared = client.submit(_hold, prepared, code_hash(), pure=False)
         self.executor = client.get_executor(pure=False, retries=0)
         self._threads, self._asked = 0, -ASK_SECONDS
         if self.width == AHEAD and not self._threads:

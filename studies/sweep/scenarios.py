@@ -284,9 +284,7 @@ class Study:
 
     @functools.cached_property
     def _code(self) -> str:
-        packages = [fingerprint.source_hash(package) for package in ("jaxmpc", "identify")]
-        modules = [fingerprint.module_hash(f"studies.{name}") for name in COMPUTING]
-        return fingerprint.content_hash(packages, modules, models.STEPS, models.SAMPLES)
+        return code_hash()
 
     @functools.cached_property
     def _variant_hashes(self) -> list[str]:
@@ -301,6 +299,13 @@ class Study:
             )
             for v in self._inputs.variants
         ]
+
+
+def code_hash() -> str:
+    """Of the code that turns the numbers of a scenario into results."""
+    packages = [fingerprint.source_hash(package) for package in ("jaxmpc", "identify")]
+    modules = [fingerprint.module_hash(f"studies.{name}") for name in COMPUTING]
+    return fingerprint.content_hash(packages, modules, models.STEPS, models.SAMPLES)
 
 
 def expand(definition: StudyDefinition, *, confirmed: bool = False) -> Study:
