@@ -81,7 +81,7 @@ def time_per_sample(series: dict[str, Any]) -> Iterator[Figure]:
                     color=style.BLACK,
                     linewidth=0.9,
                     linestyle=line,
-                    label=style.printed(f"{word}: {value:.2g} ms"),
+                    label=style.printed(f"{word}: {_milliseconds(value)} ms"),
                 )
             ax.set_yscale("log")
             ax.set_ylabel("time per sample [ms]")
@@ -89,6 +89,11 @@ def time_per_sample(series: dict[str, Any]) -> Iterator[Figure]:
             ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.1)
         axes[-1].set_xlabel("time [h]")
         yield drawn
+
+
+def _milliseconds(value: float) -> str:
+    """Two digits, and no power of ten for a hundred and more."""
+    return f"{value:,.0f}" if value >= 99.5 else f"{value:.2g}"
 
 
 @contextlib.contextmanager

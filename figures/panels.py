@@ -21,16 +21,24 @@ def run_colour(data: xr.Dataset, controller: str) -> str:
     """The controller's colour."""
     run = run_of(data, controller)
     names = [str(name) for name in data.controller.values]
+    tuning = str(run.tuning_preset.item()) if "tuning_preset" in run else ""
+    if tuning in style.TUNING_COLOURS:
+        return style.TUNING_COLOURS[tuning]
     return style.colour(str(run.kind.item()), str(run.actuator.item()), names.index(controller))
 
 
-def time_axis(axes: Axes, start: float, end: float) -> float:
+def time_axis(axes: Axes, start: float, end: float, bins: int = 12) -> float:
     """Label the time axis in hours, or in minutes below four hours; returns the seconds in that unit."""
-    seconds, name = (60.0, "min") if end - start < 4 * HOUR else (HOUR, "h")
+    seconds, name = time_unit(start, end)
     axes.set_xlabel(f"time [{name}]")
     axes.set_xlim(start / seconds, end / seconds)
-    axes.xaxis.set_major_locator(MaxNLocator(nbins=12, steps=[1, 2, 5, 10], integer=True))
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=bins, steps=[1, 2, 5, 10], integer=True))
     return seconds
+
+
+def time_unit(start: float, end: float) -> tuple[float, str]:
+    """Unit of a time axis from `start` to `end` [s]: its seconds and its name."""
+    return (60.0, "min") if end - start < 4 * HOUR else (HOUR, "h")
 
 
 def controlled(
@@ -38,27 +46,84 @@ def controlled(
 ) -> None:
     """A measured CV, its setpoint dashed, and the deadzone of Soft MPC as a band where there is one."""
     run = run_of(data, controller).sel(cv=cv)
-    t = data.time.values / seconds
-    ends = np.append(data.time.values, data.time.values[-1] + data.attrs["dt"]) / seconds
-    setpoint = _held(run.setpoint.values)
     half = soft_half_width(run)
     if half > 0:
-        name = f"deadzone ±{half:g} {style.unit(str(run.cv_unit.item()))}"
-        low, high = setpoint - half, setpoint + half
-        axes.fill_between(ends, low, high, step="post", color=style.BAND, linewidth=0, label=name)
+        t, low = _ends(data) / seconds, _held(run.setpoint.values) - half
+        label = _deadzone(run, half)
+        axes.fill_between(t, low, low + 2 * half, step="post", color=style.BAND, linewidth=0, label=label)
+    measured(axes, data, controller, cv, seconds)
+    setpoint(axes, data, cv, seconds)
+    if legend:
+        legend_above(axes)
+
+
+def measured(
+    axes: Axes,
+    data: xr.Dataset,
+    controller: str,
+    cv: str,
+    seconds: float,
+    label: str = "measured",
+    colour: str | None = None,
+) -> None:
+    """A measured CV; in the controller's colour if none is given."""
+    run = run_of(data, controller).sel(cv=cv)
     axes.plot(
-        t,
+        data.time.values / seconds,
         run.measurement.values,
-        color=run_colour(data, controller),
+        color=colour or run_colour(data, controller),
         linewidth=_width(data),
-        label="measured",
-    )
-    axes.step(
-        ends, setpoint, where="post", color=style.BLACK, linestyle="--", linewidth=1.0, label="setpoint"
+        label=label,
     )
     axes.set_ylabel(style.label(cv, str(run.cv_unit.item())))
-    if legend:
-        axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=3, borderaxespad=0.1)
+
+
+def setpoint(axes: Axes, data: xr.Dataset, cv: str, seconds: float) -> None:
+    """The setpoint of a CV, dashed."""
+    values = _held(data.setpoint.sel(cv=cv).values)
+    t = _ends(data) / seconds
+    axes.step(t, values, where="post", color=style.BLACK, linestyle="--", linewidth=1.0, label="setpoint")
+
+
+def deadzone_lines(axes: Axes, data: xr.Dataset, controller: str, cv: str, seconds: float) -> None:
+    """The borders of the deadzone thin and dashed, for panels whose background already has a meaning."""
+    run = run_of(data, controller).sel(cv=cv)
+    half = soft_half_width(run)
+    if half > 0:
+        for side, label in ((-half, None), (half, _deadzone(run, half))):
+            axes.step(
+                _ends(data) / seconds,
+                _held(run.setpoint.values) + side,
+                where="post",
+                color=style.GREY,
+                linestyle=(0, (3, 3)),
+                linewidth=0.8,
+                label=label,
+            )
+
+
+def legend_above(axes: Axes, columns: int = 3) -> None:
+    """A legend on top of the panel, where it hides nothing."""
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=columns, borderaxespad=0.1)
+
+
+def mark(axes: Axes, at: float, label: str | None = None) -> None:
+    """A dotted line where something happens; `at` in the unit of the time axis."""
+    axes.axvline(at, color=style.BLACK, linestyle=":", linewidth=1.1, label=label)
+
+
+def span(data: xr.Dataset) -> tuple[float, float]:
+    """Start of the first and end of the last sample [s]."""
+    return float(data.time.values[0]), float(data.time.values[-1]) + float(data.attrs["dt"])
+
+
+def _deadzone(run: xr.Dataset, half: float) -> str:
+    return f"deadzone ±{half:g} {style.unit(str(run.cv_unit.item()))}"
+
+
+def _ends(data: xr.Dataset) -> np.ndarray:
+    """Starts of the samples and the end of the last one [s]."""
+    return np.append(data.time.values, span(data)[1])
 
 
 def choke(axes: Axes, data: xr.Dataset, controller: str, seconds: float, legend: bool = True) -> None:
@@ -74,11 +139,13 @@ def manipulated(
     seconds: float,
     demand: bool = False,
     legend: bool = True,
+    label: str = "actual",
+    colour: str | None = None,
 ) -> None:
     """An MV as the actuator holds it over each sample, with the controller's demand if asked for."""
     run = run_of(data, controller).sel(mv=mv)
-    t = np.append(data.time.values, data.time.values[-1] + data.attrs["dt"]) / seconds
-    colour = run_colour(data, controller)
+    t = _ends(data) / seconds
+    colour = colour or run_colour(data, controller)
     width = _width(data)
     if demand:
         axes.step(
@@ -89,10 +156,10 @@ def manipulated(
             linewidth=0.6 * width,
             label="demanded",
         )
-    axes.step(t, _held(run.position.values), where="post", color=colour, linewidth=width, label="actual")
+    axes.step(t, _held(run.position.values), where="post", color=colour, linewidth=width, label=label)
     axes.set_ylabel(style.label(mv, str(run.mv_unit.item())))
     if legend and demand:
-        axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=2, borderaxespad=0.1)
+        legend_above(axes)
 
 
 def bias(axes: Axes, data: xr.Dataset, controller: str, cv: str, seconds: float) -> None:
@@ -115,11 +182,11 @@ def _held(values: np.ndarray) -> np.ndarray:
     return np.append(values, values[-1])
 
 
-def limits(axes: Axes, *values: xr.DataArray) -> None:
-    """Vertical limits that hold all given values, so that figures of several controllers compare."""
+def limits(axes: Axes, *values: xr.DataArray, least: float = 0.0) -> None:
+    """Vertical limits that hold all given values, so that figures of several controllers compare; `least` wide."""
     low = min(float(value.min()) for value in values)
     high = max(float(value.max()) for value in values)
-    margin = 0.05 * (high - low) or 1.0
+    margin = max(0.05 * (high - low), (least - (high - low)) / 2) or 1.0
     axes.set_ylim(low - margin, high + margin)
     axes.yaxis.set_major_locator(MaxNLocator(nbins=7, steps=[1, 2, 5, 10]))
 

@@ -17,6 +17,7 @@ import matplotlib
 matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -24,7 +25,7 @@ from jaxmpc.files import write_atomically
 
 BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
 ORANGE, SKY, PURPLE, BLACK, GREY = "#E69F00", "#56B4E9", "#CC79A7", "#222222", "#7F7F7F"
-BAND = "#E3E3E3"
+BAND, FUTURE = "#E3E3E3", "#F0F0F0"
 
 # by what the controller is, so that the same controller has the same colour in every study
 CONTROLLER_COLOURS = {
@@ -33,6 +34,9 @@ CONTROLLER_COLOURS = {
     ("mixed-integer", "step"): GREEN,
 }
 SPARE_COLOURS = (PURPLE, ORANGE, SKY)
+# of a tuning that is compared with that of the thesis under the same controller
+TUNING_COLOURS = {"no-soft": PURPLE, "no-soft-plain": SKY}
+PLAN = ORANGE  # what a controller intends: plans and predictions, and the run that only carries one out
 SERIES = ((BLUE, "-"), (ORANGE, "--"), (GREEN, "-."))  # three curves of one kind
 VERDICT_COLOURS = {
     "holds": GREEN,
@@ -78,13 +82,22 @@ def figure(
         row_height: of one panel [inch].
         **options: for `matplotlib.pyplot.subplots`.
     """
+    with grid(rows, 1, width, row_height, **options) as (drawn, axes):
+        yield drawn, list(axes[:, 0])
+
+
+@contextlib.contextmanager
+def grid(
+    rows: int, columns: int, width: float = 9.6, row_height: float = 2.0, **options
+) -> Iterator[tuple[Figure, np.ndarray]]:
+    """A figure of panels in rows and columns, axes ``"row column"``; arguments of `figure`."""
     with plt.rc_context(RC):
         options = {"sharex": True, **options}
         drawn, axes = plt.subplots(
-            rows, 1, figsize=(width, row_height * rows + 0.5), squeeze=False, **options
+            rows, columns, figsize=(width, row_height * rows + 0.5), squeeze=False, **options
         )
         try:
-            yield drawn, list(axes[:, 0])
+            yield drawn, axes
         finally:
             plt.close(drawn)
 

@@ -11,7 +11,7 @@ from studies.store import open_results
 
 
 def draw_all(folder: str | Path) -> list[Path]:
-    """Draw figures 10, 11 and 14 to 24 and the summary page; write the summary as Markdown and CSV.
+    """Draw figures 10, 11, 14 to 24 and 39 and the summary page; write the summary as Markdown and CSV.
 
     Args:
         folder: of the study; figures go to its ``figures`` folder.

@@ -10,9 +10,7 @@ from matplotlib.figure import Figure
 
 from figures import panels, style
 
-
-def _span(data: xr.Dataset) -> tuple[float, float]:
-    return float(data.time.values[0]), float(data.time.values[-1]) + float(data.attrs["dt"])
+LEAST = {"choke": 10.0, "gas_lift": 100.0}  # of an axis, so that a few steps of 2 % do not look like much
 
 
 @contextlib.contextmanager
@@ -41,7 +39,7 @@ def inputs(data: xr.Dataset, controller: str) -> Iterator[Figure]:
         panels.choke(axes[0], data, controller, seconds)
         panels.manipulated(axes[1], data, controller, "gas_lift", seconds)
         for ax, mv in zip(axes, ("choke", "gas_lift"), strict=True):
-            panels.limits(ax, data.position.sel(mv=mv), data.demand.sel(mv=mv))
+            panels.limits(ax, data.position.sel(mv=mv), data.demand.sel(mv=mv), least=LEAST[mv])
             panels.changes(ax, data, seconds)
         yield drawn
 
@@ -62,5 +60,5 @@ def bias(data: xr.Dataset, controller: str) -> Iterator[Figure]:
 def _stack(data: xr.Dataset, controller: str, rows: int):
     with style.figure(rows) as (drawn, axes):
         drawn.suptitle(str(data.label.sel(controller=controller).item()), fontsize=10)
-        seconds = panels.time_axis(axes[-1], *_span(data))
+        seconds = panels.time_axis(axes[-1], *panels.span(data))
         yield drawn, axes, seconds

@@ -15,11 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from jaxmpc.errors import InputError, MissingToolError
+from jaxmpc.options import COMPARISONS, parser
 
 EXIT_OPTIMAL, EXIT_OTHER, EXIT_BAD_INPUT, EXIT_INFEASIBLE, EXIT_LIMIT = 0, 1, 2, 3, 4
 EXIT_STOPPED = 130  # what shells report for Ctrl-C
-FINISHES = ("auto", "enumeration", "highs", "branch-and-bound")
-PLANTS = ("fmu", "jax")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -32,7 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
         The exit status: 0 done (for `plan`: optimal), 2 bad input with nothing written, 3 infeasible, 4 limit
         reached with a feasible plan, 130 stopped by Ctrl-C, 1 anything else.
     """
-    options = _parser().parse_args(arguments)
+    options = parser(COMMANDS).parse_args(arguments)
     try:
         return options.run(options)
     except InputError as error:
@@ -50,214 +49,6 @@ def main(arguments: list[str] | None = None) -> int:
 def _complain(error: Exception, status: int) -> int:
     print("jaxmpc: " + " ".join(str(error).split()), file=sys.stderr)
     return status
-
-
-def _parser() -> argparse.ArgumentParser:
-    formatter = argparse.ArgumentDefaultsHelpFormatter
-    parser = argparse.ArgumentParser(
-        prog="jaxmpc", description="Model predictive control with discrete actuators.", allow_abbrev=False
-    )
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-
-    def command(group, name, run, help, **more):
-        made = group.add_parser(
-            name, help=help, description=help, formatter_class=formatter, allow_abbrev=False, **more
-        )
-        made.set_defaults(run=run)
-        return made
-
-    def family(name, help):
-        made = commands.add_parser(name, help=help, description=help, allow_abbrev=False)
-        return made.add_subparsers(title="commands", metavar="COMMAND", required=True)
-
-    plan = command(
-        commands,
-        "plan",
-        _plan,
-        "Solve one controller step from a case file (JSON, engineering units).",
-        epilog="Exit status: 0 optimal, 2 bad input (nothing is written), 3 infeasible, 4 time limit reached "
-        "with a feasible plan, 1 anything else.",
-    )
-    plan.add_argument("case", metavar="CASE.json", type=Path, help="the case file")
-    plan.add_argument(
-        "--out", metavar="PLAN.json", type=Path, default=argparse.SUPPRESS, help=_default("standard output")
-    )
-    plan.add_argument(
-        "--finish",
-        choices=FINISHES,
-        default="auto",
-        help="how integer moves are decided; each way alone is exact",
-    )
-
-    fmu = family("fmu", "Build the well as an FMU.")
-    build = command(
-        fmu, "build", _fmu_build, "Build the gas-lifted well as a co-simulation FMU; needs a C compiler."
-    )
-    build.add_argument("--fmi", type=int, choices=(2, 3), default=2, help="major version of FMI")
-    build.add_argument(
-        "--out",
-        metavar="FILE.fmu",
-        type=Path,
-        default=argparse.SUPPRESS,
-        help=_default("the cache of built FMUs"),
-    )
-
-    identify = command(
-        commands,
-        "identify",
-        _identify,
-        "Identify a step-response model: settle the plant and step each MV alone.",
-    )
-    identify.add_argument("--plant", choices=PLANTS, default="fmu", help="the FMU or the JAX well")
-    identify.add_argument(
-        "--choke", metavar="PERCENT", type=float, default=50.0, help="choke to start from [%%]"
-    )
-    identify.add_argument(
-        "--lift", metavar="RATE", type=float, default=7500.0, help="lift to start from [m3/h]"
-    )
-    identify.add_argument(
-        "--steps",
-        metavar=("CHOKE", "LIFT"),
-        type=float,
-        nargs=2,
-        default=(2.0, 100.0),
-        help="steps of choke [%%] and lift [m3/h]",
-    )
-    identify.add_argument(
-        "--samples", metavar="N", type=int, default=250, help="coefficients N [samples of 10 s]"
-    )
-    identify.add_argument(
-        "--out", metavar="MODEL.json", type=Path, default=Path("model.json"), help="where to write"
-    )
-
-    study = family("study", "Run studies, look at them, and export their results.")
-    run = command(
-        study,
-        "run",
-        _study_run,
-        "Run a study: the thesis comparison, a shipped sweep, or a sweep of your own from a TOML file.",
-        epilog="Shipped: thesis (three controllers over 78,000 s, with figures), deadzone, mismatch, blocking, robustness, "
-        "tune (a search). "
-        "A run that is stopped goes on where it was when the same command is given again. "
-        "Exit status: 0 done, 2 bad input, 130 stopped by Ctrl-C, 1 anything else.",
-    )
-    run.add_argument("study", metavar="STUDY", help="name of a shipped study, or a definition FILE.toml")
-    run.add_argument("--quick", action="store_true", help="the shortened version, one to three minutes")
-    run.add_argument(
-        "--out", metavar="DIR", type=Path, default=Path("results"), help="where results and figures go"
-    )
-    run.add_argument(
-        "--plant",
-        choices=PLANTS,
-        default=argparse.SUPPRESS,
-        help="thesis only: drive the FMU or its JAX twin (default: fmu)",
-    )
-    run.add_argument(
-        "--store",
-        metavar="PATH.zarr",
-        type=Path,
-        default=argparse.SUPPRESS,
-        help="sweeps only: the store (default: DIR/NAME.zarr)",
-    )
-    run.add_argument(
-        "--workers",
-        metavar="N",
-        type=int,
-        default=argparse.SUPPRESS,
-        help="sweeps only: processes (default: 1)",
-    )
-    run.add_argument(
-        "--dask",
-        metavar="ADDRESS",
-        default=argparse.SUPPRESS,
-        help="sweeps only: scheduler of a dask.distributed cluster, such as tcp://host:8786",
-    )
-    run.add_argument(
-        "--dry-run",
-        action="store_true",
-        default=argparse.SUPPRESS,
-        help="sweeps only: say how many scenarios, chunks, bytes and minutes, and stop",
-    )
-    run.add_argument(
-        "--yes",
-        action="store_true",
-        default=argparse.SUPPRESS,
-        help="sweeps only: run more scenarios than the confirmation limit of the study",
-    )
-    look = command(
-        study, "status", _study_status, "Say how far a sweep is, what is damaged, and what to do next."
-    )
-    look.add_argument("store", metavar="STORE", type=Path, help="the store of a sweep")
-    look.add_argument("--verify", action="store_true", help="read every file and compare checksums")
-    out = command(study, "export", _study_export, "Write the results of a sweep to one file for other tools.")
-    out.add_argument("store", metavar="STORE", type=Path, help="the store of a sweep")
-    out.add_argument("target", metavar="FILE", type=Path, nargs="?", default=None, help="where to write")
-    kinds = out.add_mutually_exclusive_group()
-    for kind, what in (
-        ("csv", "scenarios and key figures as text"),
-        ("parquet", "the same, binary; needs pyarrow"),
-        ("netcdf", "everything, trajectories included"),
-    ):
-        kinds.add_argument(
-            f"--{kind}", dest="kind", action="store_const", const=kind, default=None, help=what
-        )
-    out.add_argument("--overwrite", action="store_true", help="replace the file if it is there")
-
-    rerun = command(
-        commands, "simulate", _simulate, "Run one scenario of a stored sweep again, in full, and plot it."
-    )
-    rerun.add_argument("scenario", metavar="STORE#NUMBER", help="the store of a sweep and a scenario in it")
-    rerun.add_argument(
-        "--out", metavar="DIR", type=Path, default=Path("results"), help="where trajectory and figure go"
-    )
-
-    bench = command(
-        commands,
-        "bench",
-        _bench,
-        "Time our solvers beside others on recorded samples of the thesis run, and check every solution.",
-        epilog="Times are wall times [ms] or [s], rates are per second. The other solvers come with pip install "
-        "'jaxmpc[bench]'; one that is not installed is named as missing. Ctrl-C prints what was measured so far. "
-        "Exit status: 0 done, 2 bad input, 1 stopped early or one of our solutions is wrong.",
-    )
-    bench.add_argument(
-        "--quick",
-        action="store_true",
-        help="a few samples of a short run, about two minutes in place of twelve",
-    )
-    bench.add_argument(
-        "--only",
-        metavar="SECTION[,SECTION]",
-        default=argparse.SUPPRESS,
-        help="what to measure: relaxed, batch, exact, loop, growth, startup, sweep, gpu (default: all)",
-    )
-    bench.add_argument(
-        "--sweep",
-        dest="only",
-        action="store_const",
-        const="sweep",
-        default=argparse.SUPPRESS,
-        help="what a study costs beside its closed loops: the same as --only sweep",
-    )
-    bench.add_argument(
-        "--json",
-        metavar="FILE",
-        type=Path,
-        default=argparse.SUPPRESS,
-        help="where to write every row (default: nowhere)",
-    )
-    bench.add_argument(
-        "--figures",
-        metavar="DIR",
-        type=Path,
-        default=argparse.SUPPRESS,
-        help="where to draw time per sample over the run and rate over batch size (default: nowhere)",
-    )
-    return parser
-
-
-def _default(text: str) -> str:
-    return f"where to write (default: {text})"
 
 
 def _plan(options: argparse.Namespace) -> int:
@@ -358,27 +149,35 @@ SWEEP_OPTIONS = ("store", "workers", "dask", "dry_run", "yes")
 
 def _study_run(options: argparse.Namespace) -> int:
     given = vars(options)
-    if options.study == "thesis":
+    if options.study in COMPARISONS:
         for name in SWEEP_OPTIONS:
             if name in given:
                 raise InputError(
-                    f"--{name.replace('_', '-')}", given[name], "a sweep study; thesis runs in one process"
+                    f"--{name.replace('_', '-')}",
+                    given[name],
+                    f"a sweep study; {options.study} runs in one process",
                 )
-        return _study_thesis(options, given.get("plant", "fmu"))
+        return _study_comparison(options, given.get("plant", "fmu"))
     if "plant" in given:
-        raise InputError("--plant", given["plant"], "the study thesis; sweeps run on the JAX well")
+        raise InputError("--plant", given["plant"], "a comparison such as thesis; sweeps run on the JAX well")
     return _study_sweep(options, given)
 
 
-def _study_thesis(options: argparse.Namespace, plant) -> int:
+def _study_comparison(options: argparse.Namespace, plant) -> int:
     _check_writable("--out", options.out / "results")
-    from studies.thesis import run_thesis
+    from studies.catalogue import run_named
 
-    folder = run_thesis(options.out, options.quick, plant)
-    from figures.thesis import draw_all
+    folder = run_named(options.study, options.out, options.quick, plant)
+    if options.study == "thesis":
+        from figures.thesis import draw_all
 
-    draw_all(folder)
-    print(f"Summary: {folder / 'summary.md'}, figures: {folder / 'figures'}")
+        draw_all(folder)
+        print(f"Summary: {folder / 'summary.md'}, figures: {folder / 'figures'}")
+        return EXIT_OPTIMAL
+    from figures.registry import FIGURES, draw
+
+    draw([id for id, entry in FIGURES.items() if entry.study == options.study], folder, folder / "figures")
+    print(f"Results: {folder}, figures: {folder / 'figures'}")
     return EXIT_OPTIMAL
 
 
@@ -473,6 +272,24 @@ def _simulate(options: argparse.Namespace) -> int:
     return EXIT_OPTIMAL
 
 
+def _figures(options: argparse.Namespace) -> int:
+    from figures.registry import FIGURES
+
+    if not options.ids:
+        for id, entry in FIGURES.items():
+            print(f"{id:>8}  {entry.title}  ({entry.study or 'no study'})")
+        return EXIT_OPTIMAL
+    _check_writable("--out", options.out / "figure")
+    from figures.gallery import write_gallery
+    from figures.produce import produce
+
+    asked = {"results": options.results, "out": options.out, "quick": options.quick, "plant": options.plant}
+    for path in produce(options.ids, **asked):
+        print(path)
+    print(f"All on one page: {write_gallery(options.ids, **asked)}")
+    return EXIT_OPTIMAL
+
+
 def _bench(options: argparse.Namespace) -> int:
     only = getattr(options, "only", None)
     out, folder = getattr(options, "json", None), getattr(options, "figures", None)
@@ -490,6 +307,19 @@ def _bench(options: argparse.Namespace) -> int:
         for path in draw_benchmark(json.loads(report.to_json()), folder):
             print(path, file=sys.stderr)
     return EXIT_OPTIMAL if report.complete and not wrong(report) else EXIT_OTHER
+
+
+COMMANDS = {
+    "plan": _plan,
+    "fmu build": _fmu_build,
+    "identify": _identify,
+    "study run": _study_run,
+    "study status": _study_status,
+    "study export": _study_export,
+    "simulate": _simulate,
+    "figures": _figures,
+    "bench": _bench,
+}
 
 
 if __name__ == "__main__":

@@ -18,10 +18,13 @@ import numpy as np
 from jaxmpc.batch import Lanes, for_all, map_lanes, per_lane, place, variant_mesh
 from jaxmpc.controller import ContinuousController, ControllerState, StepInfo
 from jaxmpc.errors import InputError
+from jaxmpc.host_well import HostWell
+from jaxmpc.interventions import CarriedOut, checked_changes, checked_sample, handed_over
 from jaxmpc.mixed_integer import MixedIntegerController, MixedIntegerControllers
 from jaxmpc.noise import check_deviation, check_seed, noise_samples
 from jaxmpc.plant import WellPlant
 from jaxmpc.reference import Reference
+from jaxmpc.strides import able, simulate_in_strides
 from jaxmpc.structure import Structure
 from jaxmpc.sweep import Sweep, check_match, check_offsets, sampled
 from jaxmpc.together import advance_together
@@ -41,6 +44,9 @@ def simulate(
     disturbance=None,
     noise=None,
     seed: int = 0,
+    changes: Sequence[tuple[float, ContinuousController | MixedIntegerController]] = (),
+    open_loop_from: float | None = None,
+    keep_plans: bool = False,
     progress: Progress | None = None,
 ) -> Trajectory:
     """Close the loop from the plant's steady state at its default working point.
@@ -53,6 +59,10 @@ def simulate(
         disturbance: reservoir-pressure offset per sample [bar], ``"sample"``; none if not given.
         noise: standard deviation of the measurement noise, ``"cv"`` [CV unit]; none if not given.
         seed: of the noise.
+        changes: times [s] and controllers of equal structure that take over then, with the state of the one before.
+        open_loop_from: from the plan made at this time [s] on, no measurement is used and nothing is solved: the plan is
+            carried out to its end, then the MVs are held. Status, bias and objective stay those of the plan.
+        keep_plans: whether `Trajectory.plan` has the planned moves of every sample.
         progress: called with ``(done, total)`` samples.
 
     Returns:
@@ -60,7 +70,7 @@ def simulate(
 
     Raises:
         InputError: if sampling intervals differ, the reference has other CVs or ends before the run, the disturbance
-            has not one finite value per sample, or the noise not one standard deviation per CV.
+            has not one finite value per sample, the noise not one standard deviation per CV, or a change does not fit.
     """
     structure = controller.structure
     check_match(structure, plant)
@@ -72,10 +82,20 @@ def simulate(
         raise InputError("noise", noise, "one standard deviation per CV and one seed, for one run")
     errors = np.asarray(_noise(deviation, stream, 0, np.arange(len(setpoints))))
     inputs = setpoints, offsets, errors
-    if isinstance(plant, WellPlant) and isinstance(controller, ContinuousController):
-        record = _simulate_compiled(controller, plant, inputs, progress)
+    takeovers, blind = checked_changes(controller, changes, len(setpoints)), None
+    if open_loop_from is not None:
+        blind = checked_sample("open_loop_from", open_loop_from, structure, len(setpoints))
+        if takeovers and max(takeovers) > blind:
+            raise InputError("open_loop_from", open_loop_from, "a time after the last of changes")
+    plain = isinstance(plant, WellPlant) and not takeovers and blind is None
+    if plain and isinstance(controller, ContinuousController):
+        record = _simulate_compiled(controller, plant, inputs, progress, keep_plans)
+    elif plain and isinstance(controller, MixedIntegerController) and able(controller.together):
+        record = simulate_in_strides(controller.together, plant, inputs, progress)
     else:
-        record = _simulate_on_host(controller, plant, inputs, progress)
+        record = _simulate_on_host(controller, plant, inputs, progress, takeovers, blind)
+    if not keep_plans:
+        record.pop("plan", None)
     return Trajectory(setpoint=setpoints, **record, **_labels(structure, len(setpoints)))
 
 
@@ -101,6 +121,7 @@ def _record(cv, mv, state: ControllerState, info: StepInfo) -> dict[str, Any]:
         mv_demand=info.mv,
         mv=mv,
         move=info.move,
+        plan=info.moves,
         bias=state.bias,
         bias_raw=state.bias_raw,
         status=info.status,
@@ -140,7 +161,8 @@ def _scan(controller: ContinuousController, plant: WellPlant, carry, inputs, rec
 _run_chunk: Any = eqx.filter_jit(_scan)
 
 
-def _simulate_compiled(controller, plant, inputs, progress: Progress | None):
+def _simulate_compiled(controller, plant, inputs, progress: Progress | None, keep_plans: bool):
+    recorded = (*RECORDABLE, "plan") if keep_plans else RECORDABLE
     carry = _start(controller, plant)
     total, parts = len(inputs[0]), []
     ready: set[int] = set()
@@ -148,10 +170,10 @@ def _simulate_compiled(controller, plant, inputs, progress: Progress | None):
         now = jax.tree.map(lambda leaf, at=begin: leaf[at : at + CHUNK], inputs)
         count = len(now[0])
         if count not in ready:  # compile before the clock starts
-            _run_chunk.lower(controller, plant, carry, now).compile()
+            _run_chunk.lower(controller, plant, carry, now, recorded).compile()
             ready.add(count)
         started = time.perf_counter()
-        carry, record = jax.block_until_ready(_run_chunk(controller, plant, carry, now))
+        carry, record = jax.block_until_ready(_run_chunk(controller, plant, carry, now, recorded))
         # a compiled loop has no clock: every sample of a chunk gets the chunk's mean, plant included
         mean = (time.perf_counter() - started) / count
         parts.append(jax.tree.map(np.asarray, record) | {"solve_time": np.full(count, mean)})
@@ -163,40 +185,32 @@ def _simulate_compiled(controller, plant, inputs, progress: Progress | None):
 # ------------------------------------------------------------------------------------------------- on the host
 
 
-class _HostWell:
-    """The JAX well behind the interface of a stateful plant."""
-
-    def __init__(self, plant: WellPlant):
-        self.plant, self.dt = plant, plant.dt
-        self._on_device = jax.tree.map(jnp.asarray, plant)  # numbers would be sent over at every sample
-
-    def init(self):
-        self.state = self.plant.init()
-        return self.plant.measure(self.state)
-
-    def step(self, mv, disturbance: float = 0.0):
-        self.state, outputs = _advance(self._on_device, self.state, mv, disturbance)
-        return outputs
+_jitted_step: Any = eqx.filter_jit(lambda controller, *arguments: controller.step(*arguments))
 
 
-_advance: Any = jax.jit(WellPlant.step)
-_jitted_step: Any = eqx.filter_jit(ContinuousController.step)
-
-
-def _simulate_on_host(controller, plant, inputs, progress: Progress | None):
+def _simulate_on_host(
+    controller, plant, inputs, progress: Progress | None, takeovers: dict, blind: int | None
+):
     setpoints, offsets, errors = inputs
-    host = _HostWell(plant) if isinstance(plant, WellPlant) else plant
+    host = HostWell(plant) if isinstance(plant, WellPlant) else plant
     outputs = host.init()
     now = np.asarray(outputs.cv)
-    stepper: Any = _Compiled(controller)
-    if isinstance(controller, MixedIntegerController):
-        stepper = _BatchOfOne(controller.together)
-    state: ControllerState = stepper.init(now, np.asarray(outputs.mv))
-    stepper.prepare(state, now)
-    records = []
+    steppers, states = {}, {}
+    for k, one in {0: controller, **takeovers}.items():
+        steppers[k] = _BatchOfOne(one.together) if isinstance(one, MixedIntegerController) else _Compiled(one)
+        states[k] = steppers[k].init(now, np.asarray(outputs.mv))
+        steppers[k].prepare(states[k], now)  # compile before the clock starts
+    stepper, state = steppers[0], states[0]
+    records, carried = [], None
     for k in range(len(setpoints)):
         cv = np.asarray(outputs.cv) + errors[k]
-        state, record = stepper.step(state, cv, setpoints[k])
+        if k in takeovers:
+            stepper, state = steppers[k], handed_over(state, states[k])
+        if carried is None or blind is None:
+            state, record = stepper.step(state, cv, setpoints[k])
+            carried = CarriedOut(controller.structure, record) if k == blind else None
+        else:
+            record = carried.record(k - blind, cv)
         outputs = host.step(record["mv_demand"], float(offsets[k]))
         records.append(record | {"mv": np.asarray(outputs.mv)})
         if progress is not None and ((k + 1) % 20 == 0 or k + 1 == len(setpoints)):

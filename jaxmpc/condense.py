@@ -288,10 +288,16 @@ def make_instance(
             own_low = own_low.at[0].set(
                 jnp.where(mean < -limit, jnp.maximum(own_low[0], jnp.minimum(own_high[0], 0.0)), own_low[0])
             )
+        windows = window_rows(structure)
+        budget_up = budget_down = jnp.zeros(0)
+        if len(windows):
+            budget_up, budget_down = _window_budget(structure, tuning, past_moves, mv)
         ends_low, ends_high = jnp.full(blocks, room_down), jnp.full(blocks, room_up)
         if recover:
-            back_up = _fastest_return(own_high, watch, held, counts, sign=1.0)
-            back_down = _fastest_return(own_low, watch, held, counts, sign=-1.0)
+            up = (windows, budget_up / unit, integer)
+            down = (windows, budget_down / unit, integer)
+            back_up = _fastest_return(own_high, watch, held, counts, up, sign=1.0)
+            back_down = _fastest_return(own_low, watch, held, counts, down, sign=-1.0)
             ends_low = jnp.where(room_down > 0, jnp.minimum(ends_low, back_up), ends_low)
             ends_high = jnp.where(room_up < 0, jnp.maximum(ends_high, back_down), ends_high)
         # a range that follows from the MV limits keeps every box finite where the limits are
@@ -305,9 +311,7 @@ def make_instance(
             width = jnp.where(watch, 1.0, jnp.inf) * jnp.ones(len(oscillation_rows(structure)))
             row_low.append(-width)
             row_high.append(width)
-        windows = window_rows(structure)
         if len(windows):
-            budget_up, budget_down = _window_budget(structure, tuning, past_moves, mv)
             row_low.append(-budget_down / unit)
             row_high.append(budget_up / unit)
     return QpInstance(
@@ -342,14 +346,29 @@ def _implied_range(low, high, counts, integer: bool):
     return (whole_up(least), whole_down(most)) if integer else (least, most)
 
 
-def _fastest_return(limit, watch, held, counts, *, sign):
-    """Position at the block ends when every move is as large as its limit and the oscillation rows allow."""
+def _fastest_return(limit, watch, held, counts, budget, *, sign):
+    """Position at the block ends when every move is as large as its limit, oscillation and window rows allow."""
     # a move is at most one step more than the one before it: the least of all earlier limits and the steps since
     steps = np.subtract.outer(np.arange(len(limit)), np.arange(-1, len(limit)))
     reach = sign * jnp.concatenate([held[None], limit]) + steps
     slowed = jnp.where(watch & (steps >= 0) | (steps == 0), reach, jnp.inf).min(axis=1)
-    move = sign * jnp.where(jnp.isfinite(slowed), slowed, 1e9)
+    move = sign * _within_windows(jnp.where(jnp.isfinite(slowed), slowed, 1e9), watch, *budget)
     return jnp.sum(np.tri(len(limit)) * (counts * move), axis=1)
+
+
+def _within_windows(moves, watch, windows: np.ndarray, budget, integer: bool):
+    """The moves, block after block as large as the mean-move windows leave room for."""
+    if not len(windows):
+        return moves
+    if integer:  # the next move may have to be none, which the oscillation rows allow after one step
+        moves = jnp.where(watch, jnp.minimum(moves, 1.0), moves)
+    for block in range(len(moves)):
+        share = windows[:, block]
+        used = windows[:, :block] @ moves[:block]
+        room = jnp.where(share > 0, (budget - used) / np.where(share > 0, share, 1.0), jnp.inf).min()
+        room = jnp.maximum(whole_down(room) if integer else room, 0.0)
+        moves = moves.at[block].min(room)
+    return moves
 
 
 def _window_budget(structure: Structure, tuning: Tuning, past_moves, mv: int):

@@ -6,6 +6,7 @@ the whole moves of all of them side by side on the host.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import time
 from collections.abc import Sequence
@@ -83,6 +84,25 @@ class MixedIntegerControllers:
             ]
         )
         self._packings: dict[Any, Any] = {}
+        self._scales: dict[Relaxer, tuple[Lanes, np.ndarray]] = {}
+
+    @functools.cached_property
+    def constants(self) -> tuple[Lanes[CondensedQp], Any, Any]:
+        """Of problems for moves of one step: the lanes, and hard rows and integer moves where these are all there are."""
+        narrow = self.solver.relaxer(1)
+        if not self.solver.narrow:
+            return narrow.lanes, None, None
+        return Lanes(narrow.lanes.each, narrow.shared(self.count)), narrow.hard, narrow.columns
+
+    def scales_of(self, relaxer: Relaxer) -> tuple[Lanes, np.ndarray]:
+        """MV units per unit of x as lanes, and the scale of the objective per scenario."""
+        if relaxer not in self._scales:
+            lanes = Lanes(relaxer.lanes.each.scale, relaxer.lanes.shared.scale)
+            self._scales[relaxer] = (
+                lanes,
+                np.array([relaxer.scenario(i).scale for i in range(self.count)]),
+            )
+        return self._scales[relaxer]
 
     def init(
         self, cv: Float[np.ndarray, "scenario cv"], mv: Float[np.ndarray, "scenario mv"]
@@ -146,7 +166,7 @@ class MixedIntegerControllers:
         state, moves, recovering = self._remember(relaxer, observed, x, good)
         certified = lambda values: np.where(good, values, np.nan)  # noqa: E731
         value, bound = (np.array([getattr(r, key) for r in results]) for key in ("value", "bound"))
-        scale = np.array([relaxer.scenario(i).scale for i in range(self.count)])
+        scale = self.scales_of(relaxer)[1]
         with np.errstate(invalid="ignore"):
             gap = np.maximum(value - bound, 0.0) / np.maximum(np.abs(value), 1e-6 * scale)
         seconds = np.array([r.seconds for r in results])
@@ -166,15 +186,13 @@ class MixedIntegerControllers:
             # prediction and bookkeeping are shared evenly
             solve_time=seconds + max(wall - float(seconds.sum()), 0.0) / self.count,
         )
-        return state, StepInfo(**values)
+        # the module's own constructor would take longer than all of this
+        return state, _INFO.unflatten([values[name] for name in _FIELDS])
 
     def _observe(self, narrow: Relaxer, state: ControllerState, cv, setpoint):
         """`_observe` on the host: packed, and ``(state, free response, problems, relaxations or None)``."""
         given = jax.tree.map(np.asarray, state), np.asarray(cv, dtype=np.float64), setpoint
-        qps, rows, columns = narrow.lanes, None, None
-        if self.solver.narrow:
-            qps = Lanes(qps.each, narrow.shared(self.count))
-            rows, columns = narrow.hard, narrow.columns
+        qps, rows, columns = self.constants
         packings = self._packings.get(narrow)
         if packings is None:
             s = self.structure
@@ -200,9 +218,12 @@ class MixedIntegerControllers:
             recovering = jax.ShapeDtypeStruct((self.count,), jnp.bool)
             packing = Packing.of((state, state.plan, recovering))
             self._packings["remembered"] = packing
-        scales = Lanes(relaxer.lanes.each.scale, relaxer.lanes.shared.scale)
-        packings = of_observed, packing
+        scales, packings = self.scales_of(relaxer)[0], (of_observed, packing)
         return packing.unpack(np.asarray(_remember(self.memory, scales, observed, x, good, packings)))
+
+
+_FIELDS = [field.name for field in dataclasses.fields(StepInfo)]
+_INFO = jax.tree.structure(StepInfo(*(0,) * len(_FIELDS)))  # pyright: ignore[reportArgumentType]
 
 
 @jax.jit
@@ -212,8 +233,24 @@ def _init(memory: Lanes[Memory], cv, mv, cold: WarmStart) -> ControllerState:
 
 @functools.partial(jax.jit, static_argnames="packings")
 def _observe(memory: Lanes[Memory], qps: Lanes[CondensedQp], rows, columns, given, packings):
-    """After a measurement, ``"scenario"``: bias and free response, the problems for moves of one step, their relaxations."""
-    state, cv, setpoint = packings[0].unpack(given)
+    """`observed`, packed."""
+    return packings[1].pack(observed(memory, qps, rows, columns, *packings[0].unpack(given)))
+
+
+def observed(
+    memory: Lanes[Memory], qps: Lanes[CondensedQp], rows, columns, state: ControllerState, cv, setpoint
+):
+    """After a measurement, ``"scenario"``: bias and free response, the problems for moves of one step, their relaxations.
+
+    Args:
+        memory: prediction and bookkeeping.
+        qps: constants of the problems.
+        rows: hard rows; None if the relaxations are not wanted.
+        columns: integer moves.
+        state: before the sample.
+        cv: measured [CV unit].
+        setpoint: held over the horizon [CV unit].
+    """
 
     def lane(own, state, cv):
         return eqx.combine(own, memory.shared).observe(state, cv)
@@ -226,7 +263,7 @@ def _observe(memory: Lanes[Memory], qps: Lanes[CondensedQp], rows, columns, give
         return relax(qp, rows, columns, instance, instance.lower, instance.upper, start)
 
     root = None if rows is None else jax.vmap(relaxed)(qps.each, instances, state.warm)
-    return packings[1].pack((state, free_response, instances, root))
+    return state, free_response, instances, root
 
 
 @jax.jit
@@ -254,8 +291,23 @@ def _instances(
 
 @functools.partial(jax.jit, static_argnames="packings")
 def _remember(memory: Lanes[Memory], scales: Lanes, observed, x, good, packings):
-    """Apply the first moves of the plans that there are: ``(state, planned moves, recovering)``."""
+    """`remembered`, packed."""
     state, _, instances, root = packings[0].unpack(observed)
+    return packings[1].pack(remembered(memory, scales, instances, state, x, good, root.warm))
+
+
+def remembered(memory: Lanes[Memory], scales: Lanes, instances, state: ControllerState, x, good, warm):
+    """Apply the first moves of the plans that there are, ``"scenario"``: ``(state, planned moves, recovering)``.
+
+    Args:
+        memory: prediction and bookkeeping.
+        scales: MV units per unit of x.
+        instances: the problems.
+        state: after the measurement.
+        x: the plans.
+        good: whether there is one; the MVs are held otherwise.
+        warm: where the next relaxations start.
+    """
 
     def lane(own, own_scale, instance, state, x, good, warm):
         its, scale = eqx.combine(own, memory.shared), eqx.combine(own_scale, scales.shared)
@@ -266,8 +318,7 @@ def _remember(memory: Lanes[Memory], scales: Lanes, observed, x, good, packings)
         warm = jax.tree.map(lambda new, old: jnp.where(good, new, old), warm, state.warm)
         return its.remember(state, moves[0], moves, warm), moves, recovering
 
-    results = jax.vmap(lane)(memory.each, scales.each, instances, state, x, good, root.warm)
-    return packings[1].pack(results)
+    return jax.vmap(lane)(memory.each, scales.each, instances, state, x, good, warm)
 
 
 class MixedIntegerController:

@@ -39,6 +39,8 @@ class Trajectory:
         finished_by: ``"sample"``, codes of `jaxmpc.status.FINISHERS`.
         cv_names, mv_names, cv_units, mv_units: names and units in the order of the arrays.
         dt: sampling interval [s].
+        plan: ``"sample block mv"``, block moves planned at each sample [MV unit], not a number where none was made; None
+            if plans were not kept.
     """
 
     time: np.ndarray
@@ -62,6 +64,7 @@ class Trajectory:
     cv_units: tuple[str, ...]
     mv_units: tuple[str, ...]
     dt: float
+    plan: np.ndarray | None = None
 
     def __post_init__(self):
         samples = np.shape(self.time)[0] if np.ndim(self.time) == 1 else -1
@@ -73,6 +76,10 @@ class Trajectory:
                     raise InputError(
                         f"trajectory.{key}", f"shape {list(shape)}", f"shape {[max(samples, 0), *size]}"
                     )
+        shape = () if self.plan is None else np.shape(self.plan)
+        if self.plan is not None and (len(shape) != 3 or shape[::2] != (samples, len(self.mv_names))):
+            expected = f"shape [{max(samples, 0)}, blocks, {len(self.mv_names)}]"
+            raise InputError("trajectory.plan", f"shape {list(shape)}", expected)
 
     @property
     def samples(self) -> int:

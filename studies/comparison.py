@@ -7,10 +7,11 @@ second call computes only what changed.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import datetime
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,11 @@ from tqdm import tqdm
 from jaxmpc.closed_loop import simulate
 from jaxmpc.controller import ContinuousController
 from jaxmpc.errors import InputError
+from jaxmpc.gain_schedule import ModelSchedule, ScheduledController, ScheduledMixedIntegerController
 from jaxmpc.mixed_integer import MixedIntegerController
 from jaxmpc.step_response import StepResponseModel
 from jaxmpc.trajectory import Trajectory
+from jaxmpc.tuning import Tuning
 from studies.definition import ComparisonDefinition, ControllerDefinition
 from studies.fingerprint import content_hash, source_hash, versions
 from studies.store import FORMAT, ResultStore, results_template
@@ -53,6 +56,8 @@ def run_comparison(
     make_plant: Callable[[str], Any],
     plant_facts: dict[str, Any],
     extra: Callable[[], dict[str, xr.DataArray]],
+    others: Sequence[Path] = (),
+    schedule: ModelSchedule | None = None,
     progress: bool = True,
     say: Say = print,
 ) -> Path:
@@ -65,6 +70,8 @@ def run_comparison(
         make_plant: the plant with a given actuator, in its initial state.
         plant_facts: JSON-like; identifies the plant, part of every hash.
         extra: computes further variables of the results (sweep, steady-state map); called for a new store.
+        others: stores of other studies, for a new store to take equal runs from.
+        schedule: models of the controllers with `ControllerDefinition.schedule`; None if there are none.
         progress: whether to show a bar with rate and time left.
         say: receives one line per event.
 
@@ -75,11 +82,19 @@ def run_comparison(
     inputs = {
         "plant": plant_facts,
         "reference": msgspec.to_builtins(definition.reference),
+        "disturbance": msgspec.to_builtins(definition.disturbance),
         "model": np.asarray(model.coefficients),
         "model_dt": model.dt,
         "code": code,
     }
-    hashes = [content_hash(inputs, controller.resolved()) for controller in definition.controllers]
+    scheduled: dict[str, Any] = {}
+    if schedule is not None:
+        parts = schedule.choke, schedule.lift, schedule.coefficients
+        scheduled["schedule"] = [np.asarray(part) for part in parts]
+    hashes = [
+        content_hash(inputs | (scheduled if controller.schedule else {}), controller.resolved())
+        for controller in definition.controllers
+    ]
     study_hash = content_hash(FORMAT, msgspec.to_builtins(definition), hashes)
     store = ResultStore.begin(
         folder,
@@ -87,13 +102,15 @@ def run_comparison(
         study_hash,
         lambda: comparison_template(definition, model, extra(), hashes, study_hash, plant_facts, code),
         say,
+        others,
     )
     for controller in definition.controllers:
         if store.complete(controller.name):
             say(f"{controller.label}: stored already.")
             continue
         started = time.perf_counter()
-        trajectory = run_controller(controller, definition, model, make_plant, progress)
+        given = {"schedule": schedule} if controller.schedule else {}
+        trajectory = run_controller(controller, definition, model, make_plant, progress, **given)
         wall_time = time.perf_counter() - started
         store.write(controller.name, trajectory, wall_time)
         say(f"{controller.label}: {trajectory.samples} samples in {wall_time:.1f} s.")
@@ -106,21 +123,45 @@ def run_controller(
     model: StepResponseModel,
     make_plant: Callable[[str], Any],
     progress: bool = True,
+    schedule: ModelSchedule | None = None,
 ) -> Trajectory:
     """One closed loop of a comparison.
 
     Args:
         definition: of the controller.
-        comparison: gives the reference.
+        comparison: gives the reference and the disturbance.
         model: prediction model.
         make_plant: the plant with a given actuator.
         progress: whether to show a bar with rate and time left.
+        schedule: prediction models of a controller with a schedule.
     """
-    kind = MixedIntegerController if definition.kind == "mixed-integer" else ContinuousController
-    controller = kind(definition.structure(), definition.build_tuning(), model)
+    structure = definition.structure()
+
+    def controller(tuning: Tuning) -> ContinuousController | MixedIntegerController:
+        if definition.schedule:
+            if schedule is None:
+                raise InputError("schedule", None, f"a gain schedule for {definition.name}")
+            if definition.kind == "continuous":
+                return ScheduledController(structure, tuning, schedule)
+            return ScheduledMixedIntegerController(
+                structure, tuning, schedule, time_limit=definition.time_limit
+            )
+        if definition.kind == "continuous":
+            return ContinuousController(structure, tuning, model)
+        return MixedIntegerController(structure, tuning, model, time_limit=definition.time_limit)
+
     plant = make_plant(definition.actuator)
     with _bar(definition.label, progress) as report, _closing(plant):
-        return simulate(controller, plant, comparison.reference.build(), progress=report)
+        return simulate(
+            controller(definition.build_tuning()),
+            plant,
+            comparison.reference.build(),
+            disturbance=comparison.offsets(structure.dt),
+            changes=[(at, controller(tuning)) for at, tuning in definition.later_tunings()],
+            open_loop_from=definition.open_loop_from,
+            keep_plans=True,
+            progress=report,
+        )
 
 
 @contextlib.contextmanager
@@ -189,6 +230,11 @@ def comparison_template(
             dims="time",
             attrs={"long_name": "index of the setpoint window", "units": "1"},
         ),
+        "disturbance": xr.DataArray(
+            definition.offsets(first.dt),
+            dims="time",
+            attrs={"long_name": "offset of the reservoir pressure", "units": "bar"},
+        ),
         "model_coefficient": xr.DataArray(
             np.asarray(model.coefficients),
             dims=("cv", "mv", "lag"),
@@ -209,6 +255,7 @@ def comparison_template(
         "title": definition.title,
         "dt": first.dt,
         "definition": msgspec.to_builtins(definition),
+        "structures": [dataclasses.asdict(controller.structure()) for controller in definition.controllers],
         "plant": plant_facts,
         "model": {"working_point": dict(model.working_point), "provenance": dict(model.provenance)},
         "code": code,
@@ -224,6 +271,7 @@ def comparison_template(
         mv_names=first.mv_names,
         cv_units=first.cv_units,
         mv_units=first.mv_units,
+        blocks=max(controller.structure().block_count for controller in definition.controllers),
         shared=shared,
         provenance=provenance,
         study_hash=study_hash,
@@ -243,6 +291,18 @@ def _controller_variables(definition: ComparisonDefinition) -> dict[str, xr.Data
                 dims=("controller", axis) if axis else ("controller",),
                 attrs={"long_name": f"tuning: {key.replace('_', ' ')}"},
             )
+    most = max(structure.block_count for structure in structures)
+    out["block_length"] = xr.DataArray(
+        np.array([[*s.blocks, *[0] * (most - s.block_count)] for s in structures], dtype="i4"),
+        dims=("controller", "block"),
+        attrs={"long_name": "samples of a block, 0 beyond the last", "units": "1"},
+    )
+    for key in ("prediction_horizon", "control_horizon"):
+        out[key] = xr.DataArray(
+            np.array([getattr(structure, key) for structure in structures], dtype="i4"),
+            dims="controller",
+            attrs={"long_name": key.replace("_", " "), "units": "1"},
+        )
     text = np.dtypes.StringDType()
     for key in ("kind", "actuator", "blocking", "tuning"):
         values = [getattr(controller, key) for controller in definition.controllers]

@@ -4,7 +4,7 @@ Layout: every trajectory variable has the axes ``controller, time`` and, where i
 one controller is one Zarr chunk and the only unit that is written. A controller's data land first and its
 ``complete`` flag last, so a run that is killed leaves nothing that looks finished. The store itself appears
 in one rename. A store that answers another question (another ``study_hash``) is set aside under its own name,
-never overwritten, and what it holds for an unchanged controller is taken over.
+never overwritten, and what it or another study holds for an unchanged controller is taken over.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,9 @@ VARIABLES: dict[str, tuple[str, str | None, str, Any, str, str]] = {
     "solve_time": ("solve_time", None, "f8", np.nan, "time of one controller step", "s"),
     "finished_by": ("finished_by", None, "i1", -1, "what proved the integer optimum", "1"),
 }
+PLAN = (
+    "plan"  # over controller, time, block and mv; not a number in the blocks that a controller does not have
+)
 
 
 def check_writable(folder: str | Path, field: str = "out") -> Path:
@@ -100,6 +103,7 @@ def results_template(
     mv_names: tuple[str, ...],
     cv_units: tuple[str, ...],
     mv_units: tuple[str, ...],
+    blocks: int,
     shared: dict[str, xr.DataArray],
     provenance: dict[str, Any],
     study_hash: str,
@@ -115,6 +119,7 @@ def results_template(
         mv_names: names of the MVs, the coordinate.
         cv_units: units of the CVs.
         mv_units: units of the MVs.
+        blocks: of the controller that has most.
         shared: variables without a trajectory: setpoints, tuning, model, sweep.
         provenance: JSON-like facts, one attribute each.
         study_hash: hash of everything that the results depend on.
@@ -132,6 +137,11 @@ def results_template(
             np.full(shape, empty, dtype=kind), dims=dims, attrs={"long_name": long_name, "units": unit}
         )
     n = len(controllers)
+    data[PLAN] = xr.DataArray(
+        np.full((n, len(time), blocks, len(mv_names)), np.nan),
+        dims=("controller", "time", "block", "mv"),
+        attrs={"long_name": "move planned at this time for every sample of a block", "units": "mv_unit"},
+    )
     data["wall_time"] = xr.DataArray(
         np.full(n, np.nan), dims="controller", attrs={"long_name": "time of the whole run", "units": "s"}
     )
@@ -174,6 +184,7 @@ class ResultStore:
         study_hash: str,
         make_template: Callable[[], xr.Dataset],
         say: Callable[[str], None] = print,
+        others: Sequence[Path] = (),
     ) -> ResultStore:
         """Open the store of a study, or make it.
 
@@ -183,6 +194,7 @@ class ResultStore:
             study_hash: hash of everything that the results depend on.
             make_template: gives the study's `results_template`; called only if there is no such store yet.
             say: receives a line when an older store is set aside or its results are taken over.
+            others: stores of other studies, for a new store to take equal runs from.
         """
         path = folder / RESULTS
         for remains in folder.glob(f"{_UNFINISHED}*"):  # of a run that was killed while it made its store
@@ -195,7 +207,7 @@ class ResultStore:
             kept = _set_aside(path)
             say(f"The results in {path} are of another definition or code; they are kept as {kept.name}.")
         _write_new(path, template)
-        store._take_over(template, say)
+        store._take_over(template, [other for other in others if other != path], say)
         return store
 
     def complete(self, controller: str) -> bool:
@@ -215,8 +227,18 @@ class ResultStore:
         for name, (field, axis, kind, *_) in VARIABLES.items():
             values = np.asarray(getattr(trajectory, field)).astype(kind)[None]
             data[name] = (("controller", "time") + ((axis,) if axis else ()), values)
+        if trajectory.plan is not None:
+            data[PLAN] = (("controller", "time", "block", "mv"), self._padded(trajectory.plan[None]))
         data["wall_time"] = (("controller",), np.array([wall_time]))
         self._write_region(controller, xr.Dataset(data))
+
+    def _padded(self, plan: np.ndarray) -> np.ndarray:
+        """Plans ``"controller time block mv"`` with the blocks of this store."""
+        with xr.open_zarr(self.path, consolidated=False, chunks=None) as data:
+            blocks = data.sizes["block"]
+        plan = plan[:, :, :blocks]  # what was cut off is padding of another store
+        missing = blocks - plan.shape[2]
+        return np.pad(plan, ((0, 0), (0, 0), (0, missing), (0, 0)), constant_values=np.nan)
 
     def _write_region(self, controller: str, data: xr.Dataset) -> None:
         i = self.controllers.index(controller)
@@ -225,10 +247,14 @@ class ResultStore:
         done = xr.Dataset({"complete": (("controller",), np.ones(1, dtype="i1"))})
         done.to_zarr(self.path, region=region, consolidated=False)
 
-    def _take_over(self, template: xr.Dataset, say: Callable[[str], None]) -> None:
-        """Copy controllers that an earlier store of this folder holds with equal content hash."""
+    def _take_over(self, template: xr.Dataset, others: list[Path], say: Callable[[str], None]) -> None:
+        """Copy controllers that an earlier store of this folder, or another study, holds with equal content hash."""
         wanted = dict(zip(self.controllers, template.content_hash.values.tolist(), strict=True))
-        for older in sorted(self.path.parent.glob("results-*.zarr")):
+        own = sorted(self.path.parent.glob("results-*.zarr"))
+        for older in [*own, *others]:
+            name_of = older.name if older in own else f"{older.parent.name}/{older.name}"
+            if not wanted:
+                return
             try:
                 with open_results(older) as data:
                     hashes = data.content_hash.values.tolist()
@@ -236,11 +262,13 @@ class ResultStore:
                         if value in hashes and bool(data.complete.values[hashes.index(value)]):
                             row = data.isel(controller=[hashes.index(value)])
                             fields = {key: row[key].variable for key in [*VARIABLES, "wall_time"]}
+                            fields[PLAN] = xr.Variable(row[PLAN].dims, self._padded(row[PLAN].values))
                             self._write_region(name, xr.Dataset(fields).load())
                             del wanted[name]
-                            say(f"{name}: taken over from {older.name}.")
+                            say(f"{name}: taken over from {name_of}.")
             except (InputError, KeyError, ValueError, OSError) as error:
-                say(f"{older.name} cannot be read, nothing is taken over from it ({error}).")
+                if older in own:
+                    say(f"{name_of} cannot be read, nothing is taken over from it ({error}).")
 
 
 def open_results(path: str | Path) -> xr.Dataset:
@@ -311,7 +339,7 @@ def _set_aside(path: Path) -> Path:
 def _write_new(path: Path, template: xr.Dataset) -> None:
     """Write the store beside its place and rename it, so that it is there whole or not at all."""
     encoding = {}
-    for name in [*VARIABLES, "wall_time", "complete"]:
+    for name in [*VARIABLES, PLAN, "wall_time", "complete"]:
         encoding[name] = {"chunks": (1, *template[name].shape[1:])}
     temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=_UNFINISHED))
     try:

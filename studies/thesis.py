@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 
 from identify.fmu import FmuPlant, build_fmu
+from identify.schedule import identify_schedule
 from identify.step_test import identify_step_response, settling_notes
 from identify.sweep import steady_sweep
 from jaxmpc.errors import InputError
@@ -29,7 +30,7 @@ from studies.definition import (
     PlantKind,
     ReferenceDefinition,
 )
-from studies.store import check_writable, locked
+from studies.store import RESULTS, check_writable, locked
 
 CONTROLLERS = (
     ControllerDefinition(
@@ -84,24 +85,52 @@ def run_thesis(
     """
     if plant not in PLANTS:
         raise InputError("plant", plant, f"one of {', '.join(PLANTS)}")
-    definition = thesis_definition(quick, plant)
+    return run_definition(thesis_definition(quick, plant), out, steady=True, progress=progress, say=say)
+
+
+def run_definition(
+    definition: ComparisonDefinition,
+    out: str | Path = "results",
+    *,
+    steady: bool = False,
+    progress: bool = True,
+    say: Callable[[str], None] = print,
+) -> Path:
+    """Build the plant, identify the model, and compute what is missing of a comparison.
+
+    Args:
+        definition: of the study.
+        out: folder of all results; this study gets its own folder in it, named like the study.
+        steady: whether the results hold the steady states of `steady_variables`.
+        progress: whether to show bars with rate and time left.
+        say: receives one line per event.
+
+    Returns:
+        The folder of the study, as from `run_thesis`; errors too.
+    """
     definition.check()
     folder = check_writable(Path(out) / definition.name)
     with locked(folder):
-        make_plant, facts = plant_factory(plant, say)
+        make_plant, facts = plant_factory(definition.plant, say)
         tested = make_plant("continuous")
         try:
             model = identify_step_response(tested)
             for note in settling_notes(model):
                 say(f"Identification: {note}.")
             model.save(folder / "model.json")
+            schedule = None
+            if any(controller.schedule for controller in definition.controllers):
+                schedule = identify_schedule(tested)
+                schedule.save(folder / "schedule.json")
             return run_comparison(
                 definition,
                 folder,
                 model=model,
                 make_plant=make_plant,
                 plant_facts=facts,
-                extra=lambda: steady_variables(tested),
+                extra=lambda: steady_variables(tested) if steady else {},
+                others=sorted(Path(out).glob(f"*/{RESULTS}")),
+                schedule=schedule,
                 progress=progress,
                 say=say,
             )

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
@@ -299,16 +300,52 @@ def test_identify_refuses_a_working_point_outside_the_well(tmp_path, capsys):
 
 def test_the_thesis_study_gets_its_options_and_bad_ones_are_reported(stub, tmp_path, capsys):
     given = []
-    stub("studies.thesis", run_thesis=lambda *options: given.append(options) or tmp_path / "r" / "thesis")
+    stub("studies.catalogue", run_named=lambda *options: given.append(options) or tmp_path / "r" / "thesis")
     stub("figures.thesis", draw_all=given.append)
     assert main(["study", "run", "thesis", "--out", str(tmp_path / "r"), "--quick", "--plant", "jax"]) == 0
-    assert given == [(tmp_path / "r", True, "jax"), tmp_path / "r" / "thesis"]
+    assert given == [("thesis", tmp_path / "r", True, "jax"), tmp_path / "r" / "thesis"]
     assert str(tmp_path / "r" / "thesis" / "summary.md") in capsys.readouterr().out
 
     def refuse(*_):
         raise InputError("reference.duration", 10, "at least 20 s")
 
-    stub("studies.thesis", run_thesis=refuse)
+    stub("studies.catalogue", run_named=refuse)
     assert main(["study", "run", "thesis", "--out", str(tmp_path / "r")]) == 2
     assert "reference.duration" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_every_study_of_the_catalogue_can_be_named_on_the_command_line():
+    from jaxmpc.options import COMPARISONS
+    from studies.catalogue import STUDIES
+
+    assert set(STUDIES) <= set(COMPARISONS)
+
+
+def test_a_comparison_draws_its_figures_beside_its_results(stub, tmp_path, capsys):
+    given = []
+    stub("studies.catalogue", run_named=lambda *options: given.append(options) or tmp_path / "r" / "soft")
+    entries = {"12": SimpleNamespace(study="soft"), "14": SimpleNamespace(study="thesis")}
+    stub("figures.registry", draw=lambda *options: given.append(options), FIGURES=entries)
+    assert main(["study", "run", "soft", "--out", str(tmp_path / "r")]) == 0
+    folder = tmp_path / "r" / "soft"
+    assert given == [("soft", tmp_path / "r", False, "fmu"), (["12"], folder, folder / "figures")]
+    assert str(folder / "figures") in capsys.readouterr().out
+
+
+def test_figures_are_listed_without_an_id_and_produced_with_one(stub, tmp_path, capsys):
+    given = []
+    stub("figures.registry", FIGURES={"12": SimpleNamespace(title="a title", study="soft")})
+    stub("figures.produce", produce=lambda ids, **rest: given.append((ids, rest)) or [tmp_path / "f.png"])
+    stub(
+        "figures.gallery",
+        write_gallery=lambda ids, **rest: given.append((ids, rest)) or tmp_path / "index.html",
+    )
+    assert main(["figures"]) == 0
+    assert "12  a title  (soft)" in capsys.readouterr().out
+    assert main(["figures", "12", "--out", str(tmp_path), "--results", "there", "--plant", "jax"]) == 0
+    asked = {"results": Path("there"), "out": tmp_path, "quick": False, "plant": "jax"}
+    assert given == [(["12"], asked), (["12"], asked)]
+    out = capsys.readouterr().out
+    assert str(tmp_path / "f.png") in out
+    assert "index.html" in out

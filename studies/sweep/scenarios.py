@@ -226,6 +226,11 @@ class Study:
             self._disturbance(k),
         )
 
+    @functools.cached_property
+    def scenario_hashes(self) -> tuple[str, ...]:
+        """`scenario_hash` of every scenario, in order."""
+        return tuple(self.scenario_hash(k) for k in range(self.count))
+
     def varying_plant(self, group: int) -> tuple[str, ...]:
         """Parameters of the well that differ within a group, so that a compiled program takes them per lane."""
         members = self.groups[group].scenarios
@@ -241,8 +246,7 @@ class Study:
         columns = [(c.key, c.label, c.unit, c.values.tolist()) for c in self.columns]
         store = self.definition.store
         chunks = [(c.group, c.scenarios.tolist()) for c in self.chunks]
-        hashes = [self.scenario_hash(k) for k in range(self.count)]
-        return fingerprint.content_hash(hashes, columns, chunks, store.every, list(store.trajectories))
+        return fingerprint.content_hash(list(self.scenario_hashes), columns, chunks, store.every, list(store.trajectories))
 
     def describe(self) -> Description:
         """What a run would do, for a dry run; prints as a short table."""

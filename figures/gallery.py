@@ -1,0 +1,162 @@
+"""One HTML page with every figure: number, title, what to see, where it comes from, and how to draw it again.
+
+The page is one file that needs nothing else: pictures are embedded, and there is no script and no address.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Iterable
+from pathlib import Path
+
+import xarray as xr
+
+from figures.entry import FigureEntry
+from figures.produce import study_folder
+from figures.registry import FIGURES, check_ids
+from jaxmpc.errors import InputError
+from jaxmpc.files import write_atomically
+from studies.definition import PLANTS, PlantKind
+from studies.store import open_results
+
+PAGE = "index.html"
+LARGEST = 10_000_000  # bytes; a page that opens at once and can be mailed
+
+
+def write_gallery(
+    ids: Iterable[str] = ("all",),
+    results: str | Path = "results",
+    out: str | Path = "figures-out",
+    quick: bool = False,
+    plant: PlantKind = "fmu",
+) -> Path:
+    """Write the page beside the figures that `figures.produce.produce` has drawn with the same arguments.
+
+    Args:
+        ids: keys of `figures.registry.FIGURES`, or ``["all"]``.
+        results: folder of all results; the captions take their numbers from them.
+        out: folder of the figures; the page goes there.
+        quick: whether the shortened studies were drawn.
+        plant: of the studies.
+
+    Returns:
+        The page, ``index.html``.
+
+    Raises:
+        InputError: for an unknown id, a figure or results that are missing, or a page of more than 10 MB; before
+            anything is written.
+    """
+    ids = check_ids(ids)
+    if plant not in PLANTS:
+        raise InputError("plant", plant, f"one of {', '.join(PLANTS)}")
+    out = Path(out)
+    for id in ids:
+        picture = out / f"{FIGURES[id].name}.png"
+        if not picture.is_file():
+            raise InputError("out", str(picture), f"the picture of figure {id}", "Draw the figures first")
+    read: dict[str, xr.Dataset] = {}
+    sections = []
+    for id in ids:
+        entry, data = FIGURES[id], None
+        if entry.study is not None:
+            if entry.study not in read:
+                read[entry.study] = open_results(study_folder(entry.study, results, quick, plant)).load()
+            data = read[entry.study]
+        picture = (out / f"{entry.name}.png").read_bytes()
+        sections.append(_section(entry, entry.text(data), picture, data, _command(entry, quick, plant)))
+    page = _page([FIGURES[id] for id in ids], sections, quick, plant)
+    if len(page.encode()) > LARGEST:
+        raise InputError("figure", ids, "figures of 10 MB together", "Ask for fewer of them")
+    return write_atomically(out / PAGE, page)
+
+
+def heading(entry: FigureEntry) -> str:
+    """``Figure 12: nominal and Soft mixed-integer MPC``."""
+    return f"Figure {entry.id}: {entry.title}" if entry.id.isdigit() else entry.title.capitalize()
+
+
+def _command(entry: FigureEntry, quick: bool, plant: PlantKind) -> str:
+    options = (" --quick" if quick else "") + (f" --plant {plant}" if plant != "fmu" else "")
+    return f"jaxmpc figures {entry.id}{options if entry.study else ''}"
+
+
+def _section(entry: FigureEntry, caption: str, picture: bytes, data: xr.Dataset | None, command: str) -> str:
+    study = "none: computed from the problem itself"
+    if data is not None:
+        study = f"{data.attrs.get('study', entry.study)} ({data.attrs.get('title', '')})"
+    source = base64.b64encode(picture).decode()
+    return f"""<section id="figure-{html.escape(entry.id)}">
+<h2>{html.escape(heading(entry))}</h2>
+<figure>
+<img alt="{html.escape(entry.alt)}" src="data:image/png;base64,{source}">
+<figcaption>{html.escape(caption)}</figcaption>
+</figure>
+<dl>
+<dt>Study</dt><dd>{html.escape(study)}</dd>
+<dt>Drawn by</dt><dd><code>{html.escape(entry.source)}</code></dd>
+<dt>Again</dt><dd><code>{html.escape(command)}</code></dd>
+</dl>
+<p class="up"><a href="#contents">Contents</a></p>
+</section>"""
+
+
+def _page(entries: list[FigureEntry], sections: list[str], quick: bool, plant: PlantKind) -> str:
+    contents = "\n".join(
+        f'<li><a href="#figure-{html.escape(entry.id)}">{html.escape(heading(entry))}</a></li>'
+        for entry in entries
+    )
+    well = "an FMU of the well" if plant == "fmu" else "the JAX twin of the well"
+    length = "shortened studies" if quick else "full studies"
+    body = "\n".join(sections)
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Figures of jaxmpc</title>
+<style>{_STYLE}</style>
+</head>
+<body>
+<header>
+<h1>Figures</h1>
+<p>Model predictive control with a discrete choke on a gas-lifted oil well: the figures of the thesis, drawn from our own
+runs ({length}, {well}). Numbers in the captions come from the same results as the curves.</p>
+</header>
+<nav id="contents" aria-label="Contents">
+<h2>Contents</h2>
+<ol>
+{contents}
+</ol>
+</nav>
+<main>
+{body}
+</main>
+</body>
+</html>
+"""
+
+
+_STYLE = """
+:root { color-scheme: light dark; --page: #ffffff; --text: #1d1d1f; --quiet: #55585e; --line: #d9dbe0; --link: #005a96; }
+@media (prefers-color-scheme: dark) {
+  :root { --page: #17181b; --text: #e8e8ea; --quiet: #a9adb5; --line: #3a3d44; --link: #7cc0f2; }
+}
+body { margin: 0 auto; padding: 1.5rem; max-width: 62rem; background: var(--page); color: var(--text);
+  font: 1rem/1.5 system-ui, sans-serif; }
+h1, h2 { line-height: 1.25; }
+h2 { font-size: 1.2rem; }
+a { color: var(--link); }
+nav ol { list-style: none; padding: 0; columns: 22rem; }
+nav li { padding: 0.1rem 0; break-inside: avoid; }
+section { border-top: 1px solid var(--line); padding-top: 0.5rem; margin-top: 2rem; }
+figure { margin: 0; }
+img { display: block; max-width: 100%; height: auto; margin: 0 auto; background: #ffffff; padding: 0.5rem;
+  border-radius: 6px; box-sizing: border-box; }
+figcaption { margin-top: 0.8rem; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: 0.15rem 1rem; margin: 0.8rem 0 0; color: var(--quiet);
+  font-size: 0.9rem; }
+dt { font-weight: 600; }
+dd { margin: 0; overflow-wrap: anywhere; }
+.up { font-size: 0.9rem; margin: 0.5rem 0 0; }
+"""

@@ -1,0 +1,91 @@
+"""Figures from nothing: the studies that they need are run if their results are missing, then all are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import msgspec
+
+from figures.registry import FIGURES, check_ids, draw
+from jaxmpc.errors import InputError
+from studies import catalogue
+from studies.definition import PLANTS, PlantKind
+from studies.fingerprint import source_hash
+from studies.store import check_writable, open_results, provenance
+
+
+def produce(
+    ids: Iterable[str],
+    results: str | Path = "results",
+    out: str | Path = "figures-out",
+    quick: bool = False,
+    plant: PlantKind = "fmu",
+    say: Callable[[str], None] = print,
+) -> list[Path]:
+    """Draw figures, and first run what is missing of the studies that they read.
+
+    Args:
+        ids: keys of `figures.registry.FIGURES`, or ``["all"]``.
+        results: folder of all results; each study has its own folder in it.
+        out: folder for the figures.
+        quick: read and run the shortened studies.
+        plant: ``fmu``, or ``jax`` for its JAX twin, which needs no C compiler.
+        say: receives one line per event.
+
+    Returns:
+        The files written, PNG and PDF of each figure.
+
+    Raises:
+        InputError: for an unknown id or plant or a folder that cannot be written, before anything runs.
+        MissingToolError: if the FMU is needed and cannot be built.
+    """
+    ids = check_ids(ids)
+    if plant not in PLANTS:
+        raise InputError("plant", plant, f"one of {', '.join(PLANTS)}")
+    check_writable(out)
+    studies = list(dict.fromkeys(FIGURES[id].study for id in ids))
+    folders: dict[str | None, Path | None] = {None: None}
+    for study in studies:
+        if study is None:
+            continue
+        folders[study] = study_folder(study, results, quick, plant)
+        if is_current(study, results, quick, plant):
+            say(f"{folders[study]}: complete.")
+        else:
+            folders[study] = catalogue.run_named(study, results, quick, plant, say=say)
+    paths = []
+    for study in studies:
+        paths += draw([id for id in ids if FIGURES[id].study == study], folders[study], out)
+    return paths
+
+
+def study_folder(study: str, results: str | Path, quick: bool, plant: PlantKind) -> Path:
+    """Where the results of a study of the catalogue are."""
+    return Path(results) / catalogue.STUDIES[study](quick, plant).name
+
+
+def is_current(study: str, results: str | Path, quick: bool, plant: PlantKind) -> bool:
+    """Whether every run of a study is stored, made from today's definition by today's code.
+
+    Args:
+        study: a key of `studies.catalogue.STUDIES`.
+        results: folder of all results.
+        quick: whether the shortened study is meant.
+        plant: of the study.
+    """
+    definition = catalogue.STUDIES[study](quick, plant)
+    try:
+        with open_results(study_folder(study, results, quick, plant)) as data:
+            # a stored definition is JSON: tuples read as lists
+            wanted = msgspec.json.decode(msgspec.json.encode(definition))
+            code = provenance(data, "code")
+            return (
+                bool((data.complete.values == 1).all())
+                and provenance(data, "definition") == wanted
+                and isinstance(code, dict)
+                and bool(code)
+                and all(source_hash(package) == known for package, known in code.items())
+            )
+    except InputError:
+        return False

@@ -1,0 +1,77 @@
+"""Closed loops in strides: the same run, number for number, as the loop that asks the host at every sample."""
+
+import numpy as np
+import pytest
+
+from identify.step_test import identify_step_response
+from jaxmpc import closed_loop, status
+from jaxmpc.closed_loop import simulate
+from jaxmpc.mixed_integer import MixedIntegerController
+from jaxmpc.plant import WellPlant
+from jaxmpc.reference import Reference
+from jaxmpc.trajectory import RECORDABLE
+from studies import presets
+
+SAMPLES = 90  # more than two calls of the longest length
+PLANT = WellPlant(actuator="step")
+REFERENCE = Reference([0, 200], [[11013, 185], [9640, 152]], 10.0 * SAMPLES)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return identify_step_response(PLANT.with_actuator("continuous"))
+
+
+def controller(model, blocking="moves", preset="thesis", **options):
+    structure = presets.structure(blocking, integer=True)
+    return MixedIntegerController(structure, presets.tuning(structure, preset), model, **options)
+
+
+def both(monkeypatch, made, **options):
+    """The run in strides, and sample by sample."""
+    in_strides = simulate(made, PLANT, REFERENCE, keep_plans=True, **options)
+    with monkeypatch.context() as patch:
+        patch.setattr(closed_loop, "able", lambda controllers: False)
+        return in_strides, simulate(made, PLANT, REFERENCE, keep_plans=True, **options)
+
+
+@pytest.mark.parametrize("blocking", ["moves", "inputs"])
+def test_strides_give_the_run_of_single_steps(monkeypatch, model, blocking):
+    disturbance = np.where(np.arange(SAMPLES) > 40, -3.0, 0.0)
+    strides, steps = both(
+        monkeypatch,
+        controller(model, blocking),
+        disturbance=disturbance,
+        noise=[20.0, 0.3],
+        seed=3,
+    )
+    assert set(np.unique(steps.finished_by)) >= {status.finisher_code("relaxation")}
+    assert (steps.finished_by != status.finisher_code("relaxation")).any(), "no sample was searched"
+    for field in (*RECORDABLE, "plan"):
+        if field != "solve_time":
+            np.testing.assert_array_equal(getattr(strides, field), getattr(steps, field), err_msg=field)
+    assert (strides.solve_time > 0).all()
+
+
+def test_progress_counts_every_sample_once(model):
+    seen = []
+    simulate(controller(model), PLANT, REFERENCE, samples=70, progress=lambda *given: seen.append(given))
+    done = [entry[0] for entry in seen]
+    assert done == sorted(done)
+    assert seen[-1] == (70, 70)
+
+
+def test_a_run_shorter_than_one_call_has_its_own_length(model):
+    run = simulate(controller(model), PLANT, REFERENCE, samples=3)
+    whole = simulate(controller(model), PLANT, REFERENCE, samples=40)
+    assert run.samples == 3
+    np.testing.assert_array_equal(run.cv, whole.cv[:3])
+
+
+def test_a_controller_whose_finish_is_prescribed_is_stepped(monkeypatch, model):
+    def refuse(*_):
+        raise AssertionError("strides close samples by the relaxation")
+
+    monkeypatch.setattr(closed_loop, "simulate_in_strides", refuse)
+    run = simulate(controller(model, finish="branch-and-bound"), PLANT, REFERENCE, samples=3)
+    assert (run.status == status.OPTIMAL).all()
