@@ -165,18 +165,32 @@ def _study_run(options: argparse.Namespace) -> int:
 
 def _study_comparison(options: argparse.Namespace, plant) -> int:
     _check_writable("--out", options.out / "results")
-    from studies.catalogue import run_named
+    asked = options.out, options.quick, plant
+    if options.study == "claims":
+        from studies.claims_study import run_claims
 
-    folder = run_named(options.study, options.out, options.quick, plant)
-    if options.study == "thesis":
-        from figures.thesis import draw_all
-
-        draw_all(folder)
-        print(f"Summary: {folder / 'summary.md'}, figures: {folder / 'figures'}")
+        print(f"Claims: {run_claims(*asked) / 'claims.html'}")
         return EXIT_OPTIMAL
-    from figures.registry import FIGURES, draw
+    if options.study == "rto":
+        from figures.rto import draw_all as draw_rto
+        from studies.rto import run_rto
 
-    draw([id for id, entry in FIGURES.items() if entry.study == options.study], folder, folder / "figures")
+        folder = run_rto(*asked)
+        draw_rto(folder)
+    else:
+        from studies.catalogue import run_named
+
+        folder = run_named(options.study, *asked)
+        if options.study == "thesis":
+            from figures.thesis import draw_all
+
+            draw_all(folder)
+            print(f"Summary: {folder / 'summary.md'}, figures: {folder / 'figures'}")
+            return EXIT_OPTIMAL
+        from figures.registry import FIGURES, draw
+
+        ids = [id for id, entry in FIGURES.items() if entry.study == options.study]
+        draw(ids, folder, folder / "figures")
     print(f"Results: {folder}, figures: {folder / 'figures'}")
     return EXIT_OPTIMAL
 

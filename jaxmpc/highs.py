@@ -213,3 +213,66 @@ def solve_qp(
     if status == highspy.HighsModelStatus.kInfeasible:
         return "infeasible", None
     return ("limit" if status == highspy.HighsModelStatus.kTimeLimit else "failed"), None
+
+
+def solve_milp(
+    cost: np.ndarray,
+    entries: tuple[np.ndarray, np.ndarray, np.ndarray],
+    row_low: np.ndarray,
+    row_high: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    integer: np.ndarray,
+    *,
+    gap: float = 1e-9,
+    seconds: float | None = None,
+) -> tuple[str, np.ndarray | None, float]:
+    """Min cost'x subject to row_low <= A x <= row_high, low <= x <= high, x_i whole where `integer`.
+
+    Args:
+        cost: ``"n"``.
+        entries: rows, columns and values of the entries of A; no place twice.
+        row_low, row_high, low, high: limits, infinite for none.
+        integer: ``"n"``, true for whole variables.
+        gap: relative gap at which the search stops.
+        seconds: time limit, None for none.
+
+    Returns:
+        ``(status, x, bound)``: ``optimal``, ``limit``, ``infeasible`` or ``failed``; the best point, None without one;
+        the proven lower bound of the cost.
+    """
+    highs = highspy.Highs()
+    for option, value in (
+        ("output_flag", False),
+        ("threads", 1),
+        ("mip_rel_gap", gap),
+        ("mip_abs_gap", 1e-10),
+        ("mip_feasibility_tolerance", 1e-9),
+        ("primal_feasibility_tolerance", 1e-9),
+        ("dual_feasibility_tolerance", 1e-9),
+    ):
+        highs.setOptionValue(option, value)
+    if seconds is not None:
+        highs.setOptionValue("time_limit", float(seconds))
+    row, column, value = (np.asarray(part) for part in entries)
+    order = np.lexsort((row, column))
+    lp = highspy.HighsLp()
+    lp.num_col_, lp.num_row_ = len(cost), len(row_low)
+    lp.col_cost_, lp.col_lower_, lp.col_upper_ = cost, low, high
+    lp.row_lower_, lp.row_upper_ = row_low, row_high
+    lp.a_matrix_.format_ = highspy.MatrixFormat.kColwise
+    lp.a_matrix_.start_ = np.searchsorted(column[order], np.arange(len(cost) + 1)).astype(np.int32)
+    lp.a_matrix_.index_, lp.a_matrix_.value_ = row[order].astype(np.int32), value[order].astype(float)
+    kinds = highspy.HighsVarType
+    lp.integrality_ = [kinds.kInteger if whole else kinds.kContinuous for whole in integer]
+    highs.passModel(lp)
+    highs.run()
+    state, info = highs.getModelStatus(), highs.getInfo()
+    if state in (highspy.HighsModelStatus.kInfeasible, highspy.HighsModelStatus.kUnboundedOrInfeasible):
+        return "infeasible", None, np.inf
+    found = np.array(highs.getSolution().col_value) if info.primal_solution_status == 2 else None
+    bound = info.mip_dual_bound if np.any(integer) else info.objective_function_value
+    if state == highspy.HighsModelStatus.kOptimal:
+        return "optimal", found, float(bound)
+    limits = (highspy.HighsModelStatus.kTimeLimit, highspy.HighsModelStatus.kIterationLimit)
+    return ("limit" if state in limits else "failed"), found, float(bound)

@@ -15,12 +15,15 @@ every CV limit, mu for every hard row and lambda for every limit of x, a solutio
 
 from __future__ import annotations
 
+import functools
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmpc.condense import CondensedQp, QpInstance
+from jaxmpc.numerics import largest
 from jaxmpc.relaxed_problem import QpSolution
 
 LEAST_MOVE = 1e-3  # [scaled moves]: what smaller moves cost is no scale for a residual
@@ -55,7 +58,7 @@ class KktResiduals(eqx.Module):
     def worst(self) -> Float[Array, ""]:
         """The largest of the five."""
         parts = (self.stationarity, self.primal, self.dual, self.complementarity, self.gap)
-        return jnp.max(jnp.stack(parts), axis=0)
+        return functools.reduce(jnp.maximum, parts)
 
 
 class _Prices(eqx.Module):
@@ -129,7 +132,7 @@ def kkt_residuals(
 
 def _largest(*values):
     """Largest magnitude in some vectors, 0 if all are empty."""
-    return jnp.max(jnp.abs(jnp.concatenate([jnp.atleast_1d(value) for value in values])), initial=0.0)
+    return largest(jnp.concatenate([jnp.atleast_1d(value) for value in values]))
 
 
 def _over(room, limit):

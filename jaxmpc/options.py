@@ -20,6 +20,8 @@ COMPARISONS = (
     "disturbance",
     "without-soft",
     "unblocked",
+    "rto",
+    "claims",
 )  # studies of a few controllers; the others are sweeps
 Run = Callable[[argparse.Namespace], int]
 

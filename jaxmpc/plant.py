@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxmpc.actuator import check_actuator, move_choke
 from jaxmpc.errors import InputError
+from jaxmpc.numerics import largest
 from jaxmpc.well import (
     DEFAULT_CHOKE,
     DEFAULT_LIFT,
@@ -164,7 +165,7 @@ def steady_state(
         return rates(s * scale, u, parameters) / scale
 
     def size(s):
-        return jnp.max(jnp.abs(drift(s)))
+        return largest(drift(s))
 
     def newton_step(count, s):
         # The growing time step keeps the matrix regular where a state has no unique equilibrium.
@@ -173,7 +174,7 @@ def steady_state(
 
     def polish(s):
         new = jax.lax.fori_loop(0, NEWTON_STEPS, newton_step, s)
-        near = jnp.max(jnp.abs(new - s) / (jnp.abs(s) + 0.05)) < 0.3
+        near = largest((new - s) / (jnp.abs(s) + 0.05)) < 0.3
         return jnp.where(near & (size(new) <= STEADY_TOLERANCE), new, s)
 
     def unfinished(carry):

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 # Modules of `jaxmpc` that no closed loop depends on.
-EDGE_MODULES = ("cli", "case", "plan", "bench")
+EDGE_MODULES = ("case", "cli", "html", "options", "plan", "rto", "rto_milp", "steady_map")
 
 
 def content_hash(*parts: Any) -> str:

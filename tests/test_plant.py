@@ -164,6 +164,14 @@ def test_steady_states_agree_with_long_simulation_over_the_whole_box():
     np.testing.assert_allclose(found.outputs.cv, outputs.cv[:, -1], rtol=1e-5, atol=0.05)
 
 
+def test_a_lane_without_numbers_is_never_steady_in_a_large_batch():
+    lanes = 800  # from about 650 on XLA's maximum leaves NaN out
+    choke, lift = np.full(lanes, 50.0), np.full(lanes, 7500.0)
+    lift[::2] = np.nan
+    found = jax.jit(jax.vmap(lambda c, q: steady_state(c, q)))(choke, lift)
+    np.testing.assert_array_equal(np.asarray(found.converged), np.isfinite(lift))
+
+
 def test_a_start_elsewhere_is_steady():
     state = PLANT.init(20.0, 5000.0, -2.0)
     after, outputs = jax.jit(PLANT.run)(state, jnp.tile(jnp.array([20.0, 5000.0]), (100, 1)), -2.0)

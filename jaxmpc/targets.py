@@ -1,0 +1,243 @@
+"""Input targets in the controller (thesis 6.7, (6.20)-(6.21)): a price on the distance of an MV from its ideal value.
+
+J_new = J + sum over j = 1..Hp of weight * (u(k+j-1) - u_target)^2, with u held after the control horizon. An MV with a
+target gets a CV of its own: its step response is 1 from the next sample on, its measurement the present demand, its
+setpoint the target. Prediction, condensing, relaxations, whole moves, batches and certificates then need not know of
+targets at all, and the answer is exact. `TargetController` hides the further CVs; `simulate_with_targets` closes the loop.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxmpc.closed_loop import simulate
+from jaxmpc.controller import ContinuousController, ControllerState, StepInfo
+from jaxmpc.errors import InputError
+from jaxmpc.host_well import HostWell
+from jaxmpc.mixed_integer import MixedIntegerController
+from jaxmpc.plant import WellPlant
+from jaxmpc.reference import Reference
+from jaxmpc.step_response import StepResponseModel, check_match
+from jaxmpc.structure import Structure
+from jaxmpc.trajectory import Trajectory
+from jaxmpc.tuning import CV_FIELDS, Tuning
+
+SUFFIX = ".target"
+
+
+def augment(
+    structure: Structure,
+    tuning: Tuning,
+    model: StepResponseModel,
+    target_weight: Mapping[str, float],
+) -> tuple[Structure, Tuning, StepResponseModel]:
+    """The controller's problem with one more CV per MV that has a target, named ``choke.target`` and the like.
+
+    Every sample j = first_penalised..Hp pays weight * (u(k+j-1) - target)^2; beyond the control horizon u is held, so that
+    its last value counts Hp - Hu + 1 times.
+
+    Args:
+        structure: static configuration.
+        tuning: weights and limits, of one controller.
+        model: step-response model.
+        target_weight: by MV name [1/MV unit^2], 0 or more; an MV that is not named gets no CV.
+
+    Returns:
+        ``(structure, tuning, model)`` with the further CVs after the others, in MV order; as given for an empty mapping.
+
+    Raises:
+        InputError: naming the MV, for unknown names and weights that are negative or not finite.
+    """
+    check_match(structure, model)
+    if not isinstance(target_weight, Mapping):
+        raise InputError("target_weight", target_weight, "a mapping from MV name to weight [1/MV unit^2]")
+    for name, weight in target_weight.items():
+        if name not in structure.mv_names:
+            raise InputError(
+                f"target_weight.{name}", weight, f"one of the MV names {', '.join(structure.mv_names)}"
+            )
+        number = isinstance(weight, (int, float, np.number)) and not isinstance(weight, bool)
+        if not number or not np.isfinite(weight) or weight < 0:
+            raise InputError(f"target_weight.{name}", weight, "a finite number, 0 or more [1/MV unit^2]")
+    mvs = [i for i, name in enumerate(structure.mv_names) if name in target_weight]
+    if not mvs:
+        return structure, tuning, model
+    names = tuple(structure.mv_names[i] + SUFFIX for i in mvs)
+    taken = [name for name in names if name in structure.cv_names]
+    if taken:
+        raise InputError("structure.cv_names", taken[0], f"no CV whose name ends in {SUFFIX}")
+    wide_names = structure.cv_names + names
+    units = _units(structure.cv_units, structure.cv_count, structure.mv_units, mvs)
+    wide_structure = dataclasses.replace(structure, cv_names=wide_names, cv_units=units)
+    new: dict[str, Any] = dict.fromkeys(CV_FIELDS, 0.0) | {"cv_low": -np.inf, "cv_high": np.inf}
+    new["cv_weight"] = [float(target_weight[structure.mv_names[i]]) for i in mvs]
+    wide = {
+        key: jnp.concatenate([getattr(tuning, key), jnp.broadcast_to(jnp.asarray(new[key]), (len(mvs),))])
+        for key in CV_FIELDS
+    }
+    own = np.zeros((len(mvs), structure.mv_count, model.samples))
+    own[np.arange(len(mvs)), mvs] = 1.0
+    wide_model = dataclasses.replace(
+        model,
+        coefficients=jnp.concatenate([model.coefficients, jnp.asarray(own)]),
+        cv_names=wide_names,
+        cv_units=_units(model.cv_units, structure.cv_count, model.mv_units, mvs),
+    )
+    return wide_structure, dataclasses.replace(tuning, **wide), wide_model
+
+
+def _units(cv_units: tuple[str, ...], cvs: int, mv_units: tuple[str, ...], mvs: list[int]) -> tuple[str, ...]:
+    """Units of the CVs and of the MVs with a target; empty where neither is known."""
+    if not cv_units and not mv_units:
+        return ()
+    return (cv_units or ("",) * cvs) + tuple(mv_units[i] if mv_units else "" for i in mvs)
+
+
+class TargetController(eqx.Module):
+    """A controller that also steers some MVs to targets; `step` takes them beside the setpoints.
+
+    With continuous moves `step` is pure JAX and can be jitted, vmapped and scanned; with an integer MV it runs on the host.
+
+    Args:
+        structure: static configuration, integer MVs or none.
+        tuning: weights and limits.
+        model: step-response model.
+        target_weight: by MV name [1/MV unit^2]; see `augment`.
+        **options: of `MixedIntegerController` or `ContinuousController`.
+
+    Attributes:
+        structure: as given, without the further CVs.
+        controller: the controller of the augmented problem.
+        targeted: MVs with a target, positions in MV order.
+    """
+
+    structure: Structure = eqx.field(static=True)
+    controller: Any
+    targeted: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        structure: Structure,
+        tuning: Tuning,
+        model: StepResponseModel,
+        target_weight: Mapping[str, float],
+        **options: Any,
+    ):
+        kind = MixedIntegerController if structure.integer_mvs else ContinuousController
+        self.structure = structure
+        self.controller: Any = kind(*augment(structure, tuning, model, target_weight), **options)
+        self.targeted = tuple(i for i, name in enumerate(structure.mv_names) if name in target_weight)
+
+    def init(self, cv: Float[Array, " cv"], mv: Float[Array, " mv"]) -> ControllerState:
+        """State at a steady state with measured CVs and present MVs (engineering units)."""
+        return self.controller.init(self._with(cv, mv), mv)
+
+    def step(
+        self,
+        state: ControllerState,
+        cv: Float[Array, " cv"],
+        setpoint: Float[Array, " cv"],
+        mv_target: Float[Array, " mv"],
+    ) -> tuple[ControllerState, StepInfo]:
+        """One sample; the objective in the info is J + J_u (6.20).
+
+        Args:
+            state: from `init` or the previous step.
+            cv: measurement now, without the further CVs [CV unit].
+            setpoint: held over the horizon [CV unit].
+            mv_target: held over the horizon [MV unit]; entries of MVs without a target are not looked at.
+        """
+        return self.controller.step(state, self._with(cv, state.mv), self._with(setpoint, mv_target))
+
+    def _with(self, cv, mv):
+        """Values of the CVs, then those of the MVs with a target: on the host where the controller is."""
+        if isinstance(self.controller, ContinuousController):
+            return jnp.concatenate([jnp.asarray(cv), jnp.asarray(mv)[jnp.asarray(self.targeted, dtype=int)]])
+        return np.concatenate([np.asarray(cv), np.asarray(mv)[list(self.targeted)]])
+
+
+def simulate_with_targets(
+    controller: TargetController,
+    plant: Any,
+    reference: Reference,
+    mv_target: Reference,
+    *,
+    noise=None,
+    **options: Any,
+) -> Trajectory:
+    """Close the loop with setpoints for the CVs and targets for the MVs.
+
+    Args:
+        controller: with the targets' weights.
+        plant: as in `jaxmpc.simulate`.
+        reference: setpoints, one column per CV.
+        mv_target: targets over time, one column per MV; columns of MVs without a target are not looked at.
+        noise: standard deviation of the measurement noise, ``"cv"`` [CV unit]; demands are known without noise.
+        **options: of `jaxmpc.simulate`.
+
+    Returns:
+        `Trajectory` of the plant's own CVs; `setpoint` has those of `reference`. Its objective is J + J_u (6.20).
+
+    Raises:
+        InputError: as `jaxmpc.simulate`, and if the targets have not one column per MV.
+    """
+    own, targeted = controller.structure, controller.targeted
+    if mv_target.cv_count != own.mv_count:
+        names = ", ".join(own.mv_names)
+        raise InputError(
+            "mv_target", f"{mv_target.cv_count} columns", f"{own.mv_count} columns, one per MV ({names})"
+        )
+    if noise is not None:
+        given = np.asarray(noise, dtype=np.float64)
+        if given.shape != (own.cv_count,):
+            raise InputError(
+                "noise", np.asarray(noise).tolist(), f"{own.cv_count} standard deviations, one per CV"
+            )
+        noise = np.append(given, np.zeros(len(targeted)))
+    both = _joined(reference, mv_target, own.dt, targeted)
+    wide = simulate(controller.controller, _Reporting(plant, targeted), both, noise=noise, **options)
+    count = own.cv_count
+    fields = {key: getattr(wide, key)[:, :count] for key in ("setpoint", "cv", "bias", "bias_raw")}
+    return dataclasses.replace(wide, **fields, cv_names=own.cv_names, cv_units=own.cv_units)
+
+
+def _joined(reference: Reference, mv_target: Reference, dt: float, targeted: tuple[int, ...]) -> Reference:
+    """Setpoints and targets in one reference, which changes where either does."""
+    duration = min(reference.duration, mv_target.duration)
+    times = sorted({0.0, *reference.times.tolist(), *mv_target.times.tolist()})
+    times = np.array([t for t in times if t < duration])
+    held = lambda r: r.setpoints[np.searchsorted(r.times, times, side="right") - 1]  # noqa: E731
+    return Reference(
+        times, np.concatenate([held(reference), held(mv_target)[:, list(targeted)]], axis=1), duration
+    )
+
+
+class _Outputs(NamedTuple):
+    cv: np.ndarray
+    mv: np.ndarray
+
+
+class _Reporting:
+    """A plant on the host that also measures the demands of the MVs with a target."""
+
+    def __init__(self, plant: Any, targeted: tuple[int, ...]):
+        self.plant = HostWell(plant) if isinstance(plant, WellPlant) else plant
+        self.targeted, self.dt = list(targeted), plant.dt
+
+    def init(self) -> _Outputs:
+        outputs = self.plant.init()
+        return self._report(outputs, outputs.mv)
+
+    def step(self, mv, disturbance: float = 0.0) -> _Outputs:
+        return self._report(self.plant.step(mv, disturbance), mv)
+
+    def _report(self, outputs, demand) -> _Outputs:
+        known = np.asarray(demand)[self.targeted]
+        return _Outputs(np.append(np.asarray(outputs.cv), known), np.asarray(outputs.mv))
