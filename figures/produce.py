@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-import msgspec
-
 from figures.registry import FIGURES, check_ids, draw
 from jaxmpc.errors import InputError
 from studies import catalogue
+from studies.comparison import is_current as stored_as
 from studies.definition import PLANTS, PlantKind
-from studies.fingerprint import source_hash
-from studies.store import check_writable, open_results, provenance
+from studies.store import check_writable
 
 
 def produce(
@@ -74,18 +72,4 @@ def is_current(study: str, results: str | Path, quick: bool, plant: PlantKind) -
         quick: whether the shortened study is meant.
         plant: of the study.
     """
-    definition = catalogue.STUDIES[study](quick, plant)
-    try:
-        with open_results(study_folder(study, results, quick, plant)) as data:
-            # a stored definition is JSON: tuples read as lists
-            wanted = msgspec.json.decode(msgspec.json.encode(definition))
-            code = provenance(data, "code")
-            return (
-                bool((data.complete.values == 1).all())
-                and provenance(data, "definition") == wanted
-                and isinstance(code, dict)
-                and bool(code)
-                and all(source_hash(package) == known for package, known in code.items())
-            )
-    except InputError:
-        return False
+    return stored_as(catalogue.STUDIES[study](quick, plant), study_folder(study, results, quick, plant))

@@ -1,20 +1,23 @@
 """How every figure looks: colours by controller, setpoints dashed, deadzones as bands, units on every axis.
 
-The colours are the Okabe-Ito set, which stays apart for colour-blind readers and in grey. Everything is drawn
-with the Agg backend and written as PNG and PDF, each file in one go.
+The colours are the Okabe-Ito set, which stays apart for colour-blind readers and in grey. Everything is
+written as PNG and PDF, each file in one go.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
+import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 
-matplotlib.use("Agg")
+if "matplotlib.pyplot" not in sys.modules and not os.environ.get("MPLBACKEND"):
+    matplotlib.use("Agg")  # needs no display; notebooks and scripts that chose a backend keep theirs
 
 import matplotlib.pyplot as plt
 import numpy as np

@@ -304,6 +304,12 @@ def _figures(options: argparse.Namespace) -> int:
     return EXIT_OPTIMAL
 
 
+def _explore(options: argparse.Namespace) -> int:
+    from studies.notebooks.launch import explore
+
+    return explore(options.port, options.headless, options.store)
+
+
 def _bench(options: argparse.Namespace) -> int:
     only = getattr(options, "only", None)
     out, folder = getattr(options, "json", None), getattr(options, "figures", None)
@@ -332,6 +338,7 @@ COMMANDS = {
     "study export": _study_export,
     "simulate": _simulate,
     "figures": _figures,
+    "explore": _explore,
     "bench": _bench,
 }
 

@@ -20,6 +20,9 @@ COMPARISONS = (
     "disturbance",
     "without-soft",
     "unblocked",
+    "gain-scheduling",
+    "mean-move",
+    "time-limit",
     "rto",
     "claims",
 )  # studies of a few controllers; the others are sweeps
@@ -33,7 +36,7 @@ def parser(run: Mapping[str, Run]) -> argparse.ArgumentParser:
         run: what each command calls with its options, by the words that name the command.
     """
     commands = _Commands(run)
-    for add in (_plan, _fmu, _identify, _study, _results, _simulate, _figures, _bench):
+    for add in (_plan, _fmu, _identify, _study, _results, _simulate, _figures, _explore, _bench):
         add(commands)
     return commands.parser
 
@@ -232,6 +235,21 @@ def _figures(commands: _Commands) -> None:
     )
     draw.add_argument("--quick", action="store_true", help="of the shortened studies")
     draw.add_argument("--plant", choices=PLANTS, default="fmu", help="drive the FMU or its JAX twin")
+
+
+def _explore(commands: _Commands) -> None:
+    app = commands.add(
+        "explore",
+        "Tune a controller with sliders in the browser, and look into the store of any study; needs "
+        "pip install 'jaxmpc[notebook]'.",
+    )
+    app.add_argument(
+        "--store", metavar="PATH", type=Path, default=None, help="study to open on the second page"
+    )
+    app.add_argument(
+        "--port", metavar="N", type=int, default=None, help="of the local server (default: a free one)"
+    )
+    app.add_argument("--headless", action="store_true", help="only serve, open no browser")
 
 
 def _bench(commands: _Commands) -> None:

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxmpc import html
 from jaxmpc import status as codes
 from jaxmpc.blocking import first_position_rows, moves_per_block, sample_moves
 from jaxmpc.condense import DRIFT, QpInstance, dynamic_matrix, make_instance
@@ -59,6 +60,10 @@ class Plan:
     solve_time_s: float
     finished_by: str | None
     warm: WarmStart | None = None
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        return html.plan(self)
 
 
 @functools.partial(jax.jit, static_argnames=("structure", "recover"))

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxmpc import html
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
 from jaxmpc.structure import Structure
@@ -55,6 +56,10 @@ class StepResponseModel(eqx.Module):
         """S(1)..S(samples), cut or continued with its last value (the process is stable, thesis 2.3.4)."""
         index = np.minimum(np.arange(samples), self.samples - 1)
         return self.coefficients[..., index]
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        return html.step_response(self)
 
     def save(self, path: str | Path) -> Path:
         """Write the model as JSON; the file is replaced in one go, so a crash leaves the old one."""

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from jaxmpc import html
 from jaxmpc.errors import InputError
 
 
@@ -85,6 +86,10 @@ class Trajectory:
     def samples(self) -> int:
         """Number of samples."""
         return len(self.time)
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        return html.trajectory(self)
 
 
 AXES = {

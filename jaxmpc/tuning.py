@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxmpc import html
 from jaxmpc.errors import InputError
 from jaxmpc.structure import Structure
 
@@ -47,6 +48,10 @@ class Tuning(eqx.Module):
     oscillation_rows: Bool[Array, " mv"]
     bias_cutoff: Float[Array, ""]
     mean_move_limit: Float[Array, " mv"]
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        return html.tuning(self, UNITS | {"bias_cutoff": "rad/s"}, _DEFAULTS)
 
 
 CV_FIELDS = (
@@ -87,6 +92,8 @@ _DEFAULTS = {
     "move_low": -np.inf,
     "move_high": np.inf,
     "mean_move_limit": np.inf,
+    "oscillation_rows": False,
+    "bias_cutoff": np.inf,
 }
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxmpc.errors import InputError
-from studies import references
+from studies import extensions, references
 from studies.definition import (
     PLANTS,
     ComparisonDefinition,
@@ -43,7 +43,9 @@ def _definition(
     **more: Any,
 ) -> ComparisonDefinition:
     reference = ReferenceDefinition(
-        tuple(float(row[0]) for row in windows), tuple(tuple(row[1:]) for row in windows), duration
+        tuple(float(row[0]) for row in windows),
+        tuple((float(row[1]), float(row[2])) for row in windows),
+        float(duration),
     )
     name, title = f"{name}-{'quick-' if quick else ''}{plant}", title + (", shortened" if quick else "")
     return ComparisonDefinition(name, title, plant, controllers, reference, **more)
@@ -154,6 +156,7 @@ STUDIES: dict[str, Callable[[bool, PlantKind], ComparisonDefinition]] = {
     "disturbance": disturbance,
     "without-soft": without_soft,
     "unblocked": unblocked,
+    **extensions.STUDIES,
 }
 
 

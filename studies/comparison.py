@@ -30,7 +30,7 @@ from jaxmpc.trajectory import Trajectory
 from jaxmpc.tuning import Tuning
 from studies.definition import ComparisonDefinition, ControllerDefinition
 from studies.fingerprint import content_hash, source_hash, versions
-from studies.store import FORMAT, ResultStore, results_template
+from studies.store import FORMAT, ResultStore, open_results, provenance, results_template
 
 Say = Callable[[str], None]
 TUNING_AXES = {
@@ -115,6 +115,29 @@ def run_comparison(
         store.write(controller.name, trajectory, wall_time)
         say(f"{controller.label}: {trajectory.samples} samples in {wall_time:.1f} s.")
     return folder
+
+
+def is_current(definition: ComparisonDefinition, folder: Path) -> bool:
+    """Whether every run of a study is stored, made from this definition by today's code.
+
+    Args:
+        definition: of the study.
+        folder: its results.
+    """
+    try:
+        with open_results(folder) as data:
+            # a stored definition is JSON: tuples are lists
+            wanted = msgspec.json.decode(msgspec.json.encode(definition))
+            code = provenance(data, "code")
+            return (
+                bool((data.complete.values == 1).all())
+                and provenance(data, "definition") == wanted
+                and isinstance(code, dict)
+                and bool(code)
+                and all(source_hash(package) == known for package, known in code.items())
+            )
+    except InputError:
+        return False
 
 
 def run_controller(

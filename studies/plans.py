@@ -14,6 +14,7 @@ import xarray as xr
 from jaxmpc.errors import InputError
 from studies import kpi
 from studies.presets import CHOKE
+from studies.store import provenance
 
 SMALLEST_MOVE = 1e-6  # % choke, less is rounding
 LONGEST_SWING = 1000.0  # s
@@ -60,6 +61,11 @@ def plan_at(data: xr.Dataset, controller: str, time: float) -> StoredPlan:
         InputError: for an unknown or unfinished controller, a time outside the run, or one at which no plan was made.
     """
     run = _finished(data, controller)
+    written = provenance(data, "definition")["controllers"]
+    if any(entry.get("schedule") for entry in written if entry["name"] == controller):
+        raise InputError(
+            "controller", controller, "one with a single model; those of a gain schedule are not stored"
+        )
     dt = float(data.attrs["dt"])
     times = data.time.values
     k = int(np.floor(time / dt + 1e-9)) if np.isfinite(time) else -1

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from jaxmpc import html
 from jaxmpc.errors import InputError
 from jaxmpc.reference import Reference
 from jaxmpc.structure import Structure
@@ -246,7 +247,9 @@ class Study:
         columns = [(c.key, c.label, c.unit, c.values.tolist()) for c in self.columns]
         store = self.definition.store
         chunks = [(c.group, c.scenarios.tolist()) for c in self.chunks]
-        return fingerprint.content_hash(list(self.scenario_hashes), columns, chunks, store.every, list(store.trajectories))
+        return fingerprint.content_hash(
+            list(self.scenario_hashes), columns, chunks, store.every, list(store.trajectories)
+        )
 
     def describe(self) -> Description:
         """What a run would do, for a dry run; prints as a short table."""
@@ -271,6 +274,10 @@ class Study:
             stored_bytes=self.count * (KEY_FIGURES + kept * points) * NUMBER_BYTES,
             seconds=seconds,
         )
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        return html.study(self)
 
     def _variant(self, k: int) -> Variant:
         if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not 0 <= k < self.count:

@@ -1,0 +1,326 @@
+"""The interactive app: a closed loop whose controls answer at once, and a page that opens study stores.
+
+``jaxmpc explore`` serves it. As a script, ``python -m studies.notebooks.explore``, it runs once and prints key figures.
+Computing is in `studies.explore`, drawing in `figures.explore`; here are only controls and where things go.
+"""
+
+import marimo
+
+__generated_with = "0.25.2"
+app = marimo.App(width="full", app_title="jaxmpc explore", css_file="explore.css")
+
+
+@app.cell
+def _():
+    import marimo as mo
+
+    return (mo,)
+
+
+@app.cell
+def _(mo):
+    from figures import explore as draw
+    from jaxmpc import html
+    from jaxmpc.errors import InputError
+    from studies import explore, presets
+
+    # Ratios to the preset's own value, so that one slider serves values of any size.
+    RATIOS = [2.0**k for k in range(-5, 6)]
+    given_store = str(mo.cli_args().get("store") or "")
+    return InputError, RATIOS, draw, explore, given_store, html, presets
+
+
+@app.cell
+def _(mo):
+    page = mo.ui.radio(["Run a loop", "Open a study"], value="Run a loop", inline=True)
+    get_pinned, set_pinned = mo.state(None)
+    return get_pinned, page, set_pinned
+
+
+@app.cell
+def _(explore, mo, presets):
+    controller = mo.ui.dropdown(list(explore.CONTROLLERS), value="mixed-integer")
+    preset = mo.ui.dropdown(list(presets.TUNINGS), value="thesis")
+    blocking = mo.ui.dropdown(list(explore.BLOCKING), value="moves")
+    length = mo.ui.dropdown({"30 min": False, "22 h": True}, value="30 min")
+    soft = mo.ui.switch(value=True, label="Soft MPC")
+    return blocking, controller, length, preset, soft
+
+
+@app.cell
+def _(RATIOS, mo, preset, presets):
+    _fields = presets.TUNINGS[preset.value]
+
+    def _slider(label, value, unit, steps=None):
+        steps = steps or [float(f"{ratio * value:.4g}") for ratio in RATIOS]
+        return mo.ui.slider(
+            steps=steps,
+            value=value,
+            label=f"{label} [{unit}]",
+            show_value=True,
+            debounce=True,
+            full_width=True,
+        )
+
+    choke_weight = _slider("choke move weight", _fields["move_weight"]["choke"], "1/%²")
+    oil_weight = _slider("oil weight", _fields["cv_weight"]["oil_rate"], "1/(m³/h)²")
+    gas_weight = _slider("gas weight", _fields["cv_weight"]["gas_rate"], "1/(m³/h)²")
+    oil_deadzone = _slider(
+        "oil deadzone", _fields["deadzone"]["oil_rate"], "m³/h", [0.5 * k for k in range(41)]
+    )
+    gas_deadzone = _slider(
+        "gas deadzone", _fields["deadzone"]["gas_rate"], "m³/h", [100.0 * k for k in range(31)]
+    )
+    return choke_weight, gas_deadzone, gas_weight, oil_deadzone, oil_weight
+
+
+@app.cell
+def _(mo):
+    def _slider(start, stop, step, value, label):
+        return mo.ui.slider(
+            start, stop, step, value=value, label=label, show_value=True, debounce=True, full_width=True
+        )
+
+    oil_setpoint = _slider(80, 240, 1, 152, "oil setpoint [m³/h]")
+    gas_setpoint = _slider(5000, 17000, 20, 9640, "gas setpoint [m³/h]")
+    pressure = _slider(-4, 4, 0.25, 0, "reservoir pressure change [bar]")
+    pressure_time = _slider(0, 1790, 10, 900, "from [s]")
+    model_choke = _slider(6, 96, 2, 50, "model: choke [%]")
+    model_lift = _slider(2500, 9500, 250, 7500, "model: lift [m³/h]")
+    return gas_setpoint, model_choke, model_lift, oil_setpoint, pressure, pressure_time
+
+
+@app.cell
+def _(
+    blocking,
+    choke_weight,
+    controller,
+    explore,
+    gas_deadzone,
+    gas_setpoint,
+    gas_weight,
+    length,
+    mo,
+    model_choke,
+    model_lift,
+    oil_deadzone,
+    oil_setpoint,
+    oil_weight,
+    page,
+    preset,
+    pressure,
+    pressure_time,
+    soft,
+):
+    _tuning = [soft, choke_weight, oil_deadzone, gas_deadzone, oil_weight, gas_weight]
+    _step = (
+        []
+        if length.value
+        else [mo.md(f"**Setpoints** from {explore.STEP_TIME:g} s"), oil_setpoint, gas_setpoint]
+    )
+    _shown = [
+        mo.Html(
+            '<div style="display:grid;grid-template-columns:auto 1fr;gap:0 1rem;align-items:center;font-size:0.9rem">'
+            f"<span>controller</span>{controller}<span>preset</span>{preset}"
+            f"<span>blocking</span>{blocking}<span>length</span>{length}</div>"
+        ),
+        *_tuning,
+        *_step,
+        mo.accordion(
+            {"Disturbance and model": mo.vstack([pressure, pressure_time, model_choke, model_lift], gap=0.4)}
+        ),
+    ]
+    mo.sidebar(
+        [mo.vstack([page, *(_shown if page.value == "Run a loop" else [])], gap=0.4)],
+        width="330px",
+    )
+    return
+
+
+@app.cell
+def _(
+    InputError,
+    blocking,
+    choke_weight,
+    controller,
+    explore,
+    gas_deadzone,
+    gas_setpoint,
+    gas_weight,
+    length,
+    mo,
+    model_choke,
+    model_lift,
+    oil_deadzone,
+    oil_setpoint,
+    oil_weight,
+    preset,
+    pressure,
+    pressure_time,
+    soft,
+):
+    run, refused = None, None
+    try:
+        _settings = explore.Settings(
+            controller=controller.value,
+            preset=preset.value,
+            soft=soft.value,
+            blocking=blocking.value,
+            choke_weight=choke_weight.value,
+            gas_weight=gas_weight.value,
+            oil_weight=oil_weight.value,
+            gas_deadzone=gas_deadzone.value,
+            oil_deadzone=oil_deadzone.value,
+            model_choke=model_choke.value,
+            model_lift=model_lift.value,
+            gas_setpoint=gas_setpoint.value,
+            oil_setpoint=oil_setpoint.value,
+            pressure=pressure.value,
+            pressure_time=pressure_time.value,
+            whole=length.value,
+        )
+        if length.value:
+            with mo.status.progress_bar(total=7800, title="22 h", show_eta=True, remove_on_exit=True) as _bar:
+                _done = [0]
+
+                def _report(done, total):
+                    _bar.update(increment=done - _done[0])
+                    _done[0] = done
+
+                run = explore.run(_settings, _report)
+        else:
+            run = explore.run(_settings)
+    except InputError as error:
+        refused = mo.callout(str(error), kind="warn")
+    return refused, run
+
+
+@app.cell
+def _(length, mo):
+    _last = 77990 if length.value else 1790
+    plan_time = mo.ui.slider(
+        0, _last, 10, value=300, label="plan made at [s]", show_value=True, debounce=True, full_width=True
+    )
+    return (plan_time,)
+
+
+@app.cell
+def _(mo, run, set_pinned):
+    pin = mo.ui.button(label="Pin this run", on_click=lambda _: set_pinned(run), disabled=run is None)
+    unpin = mo.ui.button(label="Unpin", on_click=lambda _: set_pinned(None))
+    return pin, unpin
+
+
+@app.cell
+def _(draw, explore, get_pinned, html, mo, page, pin, refused, run, unpin):
+    def _view():
+        if run is None:
+            return refused
+        pinned = get_pinned()
+        figure = draw.tracking(run.data, pinned=None if pinned is None else pinned.data)
+        now = explore.shown_figures(run)
+        before = explore.shown_figures(pinned) if pinned is not None else [(*row[:2], None) for row in now]
+        rows = []
+        for (words, unit, value), (_, _, old) in zip(now, before, strict=True):
+            number, shown = explore.written(value, unit)
+            other = [explore.written(old, unit)] if old is not None else []
+            rows.append(
+                [words, number, *(" ".join(pair) if pair[1] != shown else pair[0] for pair in other), shown]
+            )
+        head = ["", "now", *(["pinned"] if pinned is not None else []), ""]
+        side = [
+            mo.Html(
+                '<div id="key-figures" style="font-size:12px;line-height:1.3;white-space:nowrap">'
+                f"{html.table(head, rows)}</div>"
+            ),
+            mo.hstack([pin, unpin], justify="start"),
+            mo.md(f"<small>run and key figures: {run.seconds:.2f} s</small>"),
+        ]
+        image = mo.Html(draw.image(figure, "the run"))
+        return mo.hstack([image, mo.vstack(side, gap=0.3)], widths=[2.15, 1], align="start", gap=0.75)
+
+    _view() if page.value == "Run a loop" else None
+    return
+
+
+@app.cell
+def _(draw, mo, page, plan_time, run):
+    def _view():
+        figure = draw.planned(run.data, float(plan_time.value))
+        return mo.vstack([plan_time, mo.Html(draw.image(figure, "the plan"))], gap=0.3)
+
+    _view() if page.value == "Run a loop" and run is not None else None
+    return
+
+
+@app.cell
+def _(given_store, mo):
+    path = mo.ui.text(
+        value=given_store, label="study store", full_width=True, placeholder="results/deadzone.zarr"
+    )
+    return (path,)
+
+
+@app.cell
+def _(InputError, draw, mo, path):
+    table, chart, trouble = None, None, mo.md("Path of a sweep (`….zarr`) or of a comparison (its folder).")
+    if path.value.strip():
+        try:
+            table = draw.points(path.value.strip())
+            chart = mo.ui.altair_chart(draw.scatter(table), chart_selection="point", legend_selection=False)
+        except InputError as error:
+            trouble = mo.callout(str(error), kind="warn")
+    return chart, table, trouble
+
+
+@app.cell
+def _(chart, mo, page, path, trouble):
+    mo.vstack([path, chart if chart is not None else trouble]) if page.value == "Open a study" else None
+    return
+
+
+@app.cell
+def _(chart, draw, mo, path):
+    picked = None
+    if chart is not None and 0 < len(chart.value) < len(chart.dataframe):  # all of them: none is picked
+        picked = chart.value.iloc[0]
+    again = mo.ui.run_button(
+        label="Run it again, every sample", disabled=picked is None or draw.is_comparison(path.value.strip())
+    )
+    return again, picked
+
+
+@app.cell
+def _(InputError, again, draw, mo, page, path, picked):
+    def _view():
+        if picked is None:
+            return mo.md("Pick a point to see its run.")
+        store, number = path.value.strip(), int(picked["number"])
+        try:
+            if again.value:
+                from pathlib import Path
+
+                from figures.sweep import run_results
+                from studies.explore import RUN
+                from studies.sweep.rerun import rerun
+
+                with mo.status.spinner("running"):
+                    found = rerun(Path(store), number)
+                data = run_results(found.trajectory, found.deadzone, found.kind, found.actuator)
+                data = data.assign_coords(controller=[RUN])
+            else:
+                data = draw.stored(store, number)
+        except InputError as error:
+            return mo.callout(str(error), kind="warn")
+        image = mo.Html(draw.image(draw.tracking(data, wide=True), "the picked run"))
+        title = mo.md(f"**{number}**: {picked['run']}")
+        return mo.vstack([mo.hstack([title, again], justify="space-between"), image], gap=0.3)
+
+    _view() if page.value == "Open a study" else None
+    return
+
+
+if __name__ == "__main__":
+    from studies.explore import main
+
+    main()
