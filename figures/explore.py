@@ -22,8 +22,8 @@ from matplotlib.figure import Figure
 
 from figures import panels, style
 from figures.facts import index_of
-from figures.pareto import front
 from figures.sweep_data import controller_of, deviation, figure_of, load, setting, sweep_axes
+from figures.wear import front
 from jaxmpc.errors import InputError
 from studies.evaluate import completed, key_figures
 from studies.explore import RUN

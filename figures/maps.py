@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from figures import sheet, style
-from figures.pareto import MAP, linked_sentences
 from figures.sweep_data import (
     SweepAxis,
     controller_of,
@@ -25,6 +24,7 @@ from figures.sweep_data import (
     thesis_tuning,
     unit,
 )
+from figures.wear import MAP, linked_sentences
 
 LONGEST = 40  # values along an axis
 FILLED = 0.5  # of the cells, else the two axes are no grid

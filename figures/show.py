@@ -17,8 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from figures import panels, style
-from figures import pareto as wear
+from figures import panels, style, wear
 from figures.explore import is_comparison
 from figures.sweep import run_results
 from figures.sweep_data import load
@@ -83,7 +82,7 @@ def pareto(study: str | Path | xr.Dataset, x: str = "choke_travel", **options: A
     Args:
         study: path of the store, or what `open_study` gave.
         x: key figure along the horizontal axis.
-        **options: of `figures.pareto.pareto`.
+        **options: of `figures.wear.pareto`.
 
     Raises:
         InputError: if there is no store, or for a key figure that is not there.

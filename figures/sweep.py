@@ -15,10 +15,9 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from figures import fan, maps, panels, regret, style
-from figures import pareto as wear
-from figures.pareto import pareto
+from figures import fan, maps, panels, regret, style, wear
 from figures.sweep_data import load, sweep_axes
+from figures.wear import pareto
 from jaxmpc.trajectory import Trajectory
 
 __all__ = ["draw_run", "draw_sweep", "pages", "pareto"]

@@ -6,7 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from figures import fan, maps, pareto, regret, style, sweep
+from figures import fan, maps, regret, style, sweep, wear
 from figures.sweep_data import load, sweep_axes, thesis_tuning, variants
 from jaxmpc.errors import InputError
 from studies.sweep.reading import open_study
@@ -170,7 +170,7 @@ def test_the_front_is_what_no_other_point_beats(seed):
     y[rng.random(count) < 0.1] = np.nan
     known = np.isfinite(x) & np.isfinite(y)
     expected = [bool(known[i]) and not beaten(x[known], y[known], _place(known, i)) for i in range(count)]
-    np.testing.assert_array_equal(pareto.front(x, y), expected)
+    np.testing.assert_array_equal(wear.front(x, y), expected)
 
 
 def _place(known, i):
@@ -178,8 +178,8 @@ def _place(known, i):
 
 
 def test_equal_points_share_the_front_and_a_tie_in_one_is_beaten():
-    assert pareto.front([1, 1, 1, 2, np.nan], [2, 2, 3, 2, 0]).tolist() == [True, True, False, False, False]
-    assert pareto.front([], []).tolist() == []
+    assert wear.front([1, 1, 1, 2, np.nan], [2, 2, 3, 2, 0]).tolist() == [True, True, False, False, False]
+    assert wear.front([], []).tolist() == []
 
 
 def test_the_points_and_the_front_are_the_stored_numbers(deadzone):
