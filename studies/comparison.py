@@ -174,7 +174,7 @@ def run_controller(
         return MixedIntegerController(structure, tuning, model, time_limit=definition.time_limit)
 
     plant = make_plant(definition.actuator)
-    with _bar(definition.label, progress) as report, _closing(plant):
+    with progress_bar(definition.label, progress) as report, closing(plant):
         return simulate(
             controller(definition.build_tuning()),
             plant,
@@ -188,7 +188,7 @@ def run_controller(
 
 
 @contextlib.contextmanager
-def _bar(label: str, show: bool) -> Iterator[Callable[[int, int], None]]:
+def progress_bar(label: str, show: bool) -> Iterator[Callable[[int, int], None]]:
     """A progress callback ``(done, total)`` that shows samples, rate and time left."""
     often = 0.5 if sys.stderr.isatty() else 10.0  # s; a log file needs no more
     with tqdm(desc=label, unit=" samples", disable=not show, dynamic_ncols=True, mininterval=often) as bar:
@@ -201,10 +201,10 @@ def _bar(label: str, show: bool) -> Iterator[Callable[[int, int], None]]:
 
 
 @contextlib.contextmanager
-def _closing(plant: Any) -> Iterator[None]:
-    """Free what the plant holds outside Python, if it holds anything."""
+def closing(plant: Any) -> Iterator[Any]:
+    """A plant, freed at the end if it holds anything outside Python."""
     try:
-        yield
+        yield plant
     finally:
         close = getattr(plant, "close", None)
         if close is not None:

@@ -8,19 +8,15 @@ demands' deadzones that need no such lift, and the choke and lift that belong to
 
 from __future__ import annotations
 
-import contextlib
 import datetime
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from tqdm import tqdm
 
-from identify.fmu import FmuPlant
 from identify.steady_map import steady_map
 from identify.step_test import identify_step_response
 from jaxmpc.closed_loop import simulate
@@ -31,6 +27,7 @@ from jaxmpc.rto import LIFT_RANGES, Targets, optimise
 from jaxmpc.steady_map import SteadyMap
 from jaxmpc.targets import TargetController, simulate_with_targets
 from studies import presets
+from studies.comparison import closing, progress_bar
 from studies.definition import PLANTS, PlantKind
 from studies.fingerprint import content_hash, module_hash, source_hash, versions
 from studies.presets import CHOKE, GAS, LIFT, OIL
@@ -103,7 +100,7 @@ def run_rto(
     demanded = demands(quick)
     with locked(folder):
         make_plant, facts = plant_factory(plant, say)
-        with _closing(make_plant("continuous")) as tested:
+        with closing(make_plant("continuous")) as tested:
             model = identify_step_response(tested)
             steady = steady_map(tested)
         model.save(folder / "model.json")
@@ -166,7 +163,7 @@ def run_rto(
                 say(f"{label}: stored already.")
                 continue
             started = time.perf_counter()
-            with _closing(make_plant("step")) as well, _bar(label, progress) as report:
+            with closing(make_plant("step")) as well, progress_bar(label, progress) as report:
                 if name == WITHOUT:
                     controller = MixedIntegerController(structure, tuning, model)
                     run = simulate(controller, well, demanded, progress=report)
@@ -221,26 +218,3 @@ def _shared(
         attrs={"long_name": "steady CV", "units": "cv_unit"},
     )
     return out | {"kind": of_each("mixed-integer"), "actuator": of_each("step")}
-
-
-@contextlib.contextmanager
-def _closing(plant: Any) -> Iterator[Any]:
-    """A plant, freed at the end if it holds anything outside Python."""
-    try:
-        yield plant
-    finally:
-        if isinstance(plant, FmuPlant):
-            plant.close()
-
-
-@contextlib.contextmanager
-def _bar(label: str, show: bool) -> Iterator[Callable[[int, int], None]]:
-    """A progress callback ``(done, total)`` that shows samples, rate and time left."""
-    often = 0.5 if sys.stderr.isatty() else 10.0  # s; a log file needs no more
-    with tqdm(desc=label, unit=" samples", disable=not show, dynamic_ncols=True, mininterval=often) as bar:
-
-        def report(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
-        yield report
