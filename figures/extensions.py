@@ -99,10 +99,19 @@ def _reversal_bars(axes: Axes, data: xr.Dataset) -> None:
     axes.set_ylim(top=1.5 * max(1.0, axes.get_ylim()[1]))
 
 
+def _means(data: xr.Dataset, name: str) -> np.ndarray:
+    """Windowed mean of the choke moves of a run, ``"time"`` [%/sample]."""
+    run = data.sel(controller=name)
+    return np.asarray(kpi.windowed_mean(run.move.sel(mv=CHOKE).values, int(run.mean_move_window.item())))
+
+
 def opening(data: xr.Dataset) -> xr.Dataset:
-    """The first minutes of the window whose setpoints ask for most, where the choke opens all the way."""
-    start = int(np.argmax(data.setpoint.sel(cv=GAS).values))
-    return data.isel(time=slice(start, start + int(OPENING / float(data.attrs["dt"]))))
+    """The first minutes of the setpoint window in which the choke of every controller opens fast."""
+    length = int(OPENING / float(data.attrs["dt"]))
+    starts = np.flatnonzero(np.diff(data.window.values, prepend=-1))
+    means = np.stack([_means(data, str(name)) for name in data.controller.values])
+    start = int(max(starts, key=lambda k: means[:, k : k + length].max(axis=1).min()))
+    return data.isel(time=slice(start, start + length))
 
 
 @contextlib.contextmanager
@@ -121,17 +130,16 @@ def mean_move(data: xr.Dataset) -> Iterator[Figure]:
             for mode, colour in MODE_COLOURS.items():
                 name = f"{kind}-{mode}"
                 panels.manipulated(choke, zoom, name, CHOKE, seconds, legend=False, label=mode, colour=colour)
-                run = data.sel(controller=name)
-                moves = run.move.sel(mv=CHOKE).values
-                whole = np.asarray(kpi.windowed_mean(moves, int(run.mean_move_window.item())))
+                whole = _means(data, name)
                 at = np.flatnonzero(np.isin(data.time.values, zoom.time.values))
                 mean.step(zoom.time.values / seconds, whole[at], where="post", color=colour, label=mode)
             limit = float(data.tuning_mean_move_limit.sel(mv=CHOKE).values[0])
             mean.axhline(limit, color=style.BLACK, linestyle="--", linewidth=1.0, label=f"limit {limit:g} %")
             mean.set_ylabel("mean of 25 moves [%/sample]" if column == 0 else "")
             choke.set_title(f"{kind} MPC")
-            choke.legend(loc="lower right")
-            mean.legend(loc="lower center")
+            choke.ticklabel_format(useOffset=False)
+            choke.legend(loc="best")
+            mean.legend(loc="center right")
             if column:
                 choke.set_ylabel("")
         yield drawn

@@ -225,7 +225,6 @@ def test_the_notebook_is_stored_without_outputs():
         assert cell["execution_count"] is None
 
 
-@pytest.mark.slow
 def test_the_notebook_runs_from_top_to_bottom(tmp_path):
     pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")

@@ -408,7 +408,6 @@ def _answers(port):
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(bool(_missing()), reason=f"not installed: {_missing()}")
 def test_in_a_browser_a_slider_changes_figure_and_key_figures_and_a_point_shows_its_run(page, tmp_path):
     from selenium.webdriver.common.action_chains import ActionChains
