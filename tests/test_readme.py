@@ -95,3 +95,9 @@ def test_every_public_name_of_the_package_can_be_taken_from_it():
         assert getattr(jaxmpc, name).__name__ == name
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = jaxmpc.nothing
+
+
+def test_editors_see_every_public_name_of_the_package():
+    stub = (ROOT / "jaxmpc" / "__init__.pyi").read_text()
+    lines = re.findall(r"^from jaxmpc\.(\w+) import (\w+) as (\w+)$", stub, re.MULTILINE)
+    assert {name: home for home, name, same in lines if same == name} == jaxmpc._HOME_OF
