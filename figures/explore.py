@@ -50,7 +50,7 @@ def tracking(
         pinned: results of one controller `RUN` to compare with; only times of `data` are drawn.
         wide: for the width of the page instead of two thirds of it.
     """
-    cvs, mvs = _cvs(data), [str(name) for name in data.mv.values]
+    cvs, mvs = panels.cv_names(data), [str(name) for name in data.mv.values]
     start, end = panels.span(data)
     with plt.rc_context(style.RC):
         figure, axes = _panels(2, max(len(cvs), len(mvs)), 9.6 if wide else 6.9, 4.2 if wide else 4.5)
@@ -93,7 +93,7 @@ def planned(data: xr.Dataset, time: float, controller: str = RUN) -> Figure:
             ax.axvspan(plan.time / MINUTE, end / MINUTE, color=style.FUTURE, linewidth=0, zorder=0)
             panels.mark(ax, plan.time / MINUTE)
         shown = data.isel(time=np.flatnonzero((data.time.values >= start) & (data.time.values <= end)))
-        for ax, cv in zip(axes[0], _cvs(data), strict=False):
+        for ax, cv in zip(axes[0], panels.cv_names(data), strict=False):
             panels.deadzone_lines(ax, shown, controller, cv, MINUTE)
             panels.setpoint(ax, shown, cv, MINUTE)
             ax.plot(later.time / MINUTE, _values(later, "measurement", cv), color=colour, alpha=0.4)
@@ -309,10 +309,6 @@ def _values(data: xr.Dataset, name: str, channel: str) -> np.ndarray:
 
 def _held(data: xr.Dataset, values: np.ndarray, seconds: float = MINUTE) -> tuple[np.ndarray, np.ndarray]:
     return np.append(data.time.values, panels.span(data)[1]) / seconds, np.append(values, values[-1])
-
-
-def _cvs(data: xr.Dataset) -> list[str]:
-    return [str(name) for name in data.cv.values][::-1]  # oil before gas
 
 
 def _hide_unused(axes: np.ndarray, used: tuple[int, ...]) -> None:

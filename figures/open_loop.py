@@ -16,7 +16,7 @@ RUNS = (("closed-loop", "closed loop", None), ("open-loop", "open loop", style.P
 @contextlib.contextmanager
 def rates(data: xr.Dataset) -> Iterator[Figure]:
     """Oil and gas rate of both runs; `data` are the results of the study ``predictions``."""
-    names = [str(name) for name in data.cv.values][::-1]
+    names = panels.cv_names(data)
     with style.figure(2) as (drawn, axes):
         seconds = panels.time_axis(axes[-1], *panels.span(data))
         for ax, cv in zip(axes, names, strict=True):

@@ -112,6 +112,11 @@ def mark(axes: Axes, at: float, label: str | None = None) -> None:
     axes.axvline(at, color=style.BLACK, linestyle=":", linewidth=1.1, label=label)
 
 
+def cv_names(data: xr.Dataset) -> list[str]:
+    """CVs from the top panel down: oil above gas, as in the thesis."""
+    return [str(name) for name in data.cv.values][::-1]
+
+
 def span(data: xr.Dataset) -> tuple[float, float]:
     """Start of the first and end of the last sample [s]."""
     return float(data.time.values[0]), float(data.time.values[-1]) + float(data.attrs["dt"])

@@ -80,7 +80,7 @@ def swing(data: xr.Dataset, controller: str, which: int) -> Iterator[Figure]:
         for ax in rows.flat:
             ax.axvspan(at / MINUTE, end / MINUTE, color=style.FUTURE, linewidth=0, zorder=0)
             panels.mark(ax, at / MINUTE)
-        for ax, cv in zip(rows[0], _cvs(data), strict=True):
+        for ax, cv in zip(rows[0], panels.cv_names(data), strict=True):
             panels.deadzone_lines(ax, shown, controller, cv, MINUTE)
             values = plan.cv[:, index_of(data.cv, cv)]
             inside = plan.cv_time <= end
@@ -125,10 +125,6 @@ def first_change(data: xr.Dataset) -> float:
     return float(data.time.values[int(np.flatnonzero(data.window.values > 0)[0])])
 
 
-def _cvs(data: xr.Dataset) -> list[str]:
-    return [str(name) for name in data.cv.values][::-1]  # oil before gas
-
-
 def _between(data: xr.Dataset, start: float, end: float) -> xr.Dataset:
     inside = np.flatnonzero((data.time.values >= start) & (data.time.values <= end))
     return data.isel(time=inside)
@@ -147,7 +143,7 @@ def _held_plan(data: xr.Dataset, plan: StoredPlan, mv: str) -> tuple[np.ndarray,
 
 
 def _plan(rows: np.ndarray, data: xr.Dataset, plan: StoredPlan, line: str) -> None:
-    for ax, cv in zip(rows[0], _cvs(data), strict=True):
+    for ax, cv in zip(rows[0], panels.cv_names(data), strict=True):
         values = plan.cv[:, index_of(data.cv, cv)]
         ax.plot(plan.cv_time / MINUTE, values, line, color=style.PLAN, linewidth=1.6, label="plan")
     for ax, below, mv in zip(rows[1], rows[2], ("choke", "gas_lift"), strict=True):
@@ -161,7 +157,7 @@ def _plan(rows: np.ndarray, data: xr.Dataset, plan: StoredPlan, line: str) -> No
 def _evolution(rows: np.ndarray, measured: xr.Dataset, moved: xr.Dataset, controller: str) -> None:
     """CVs of the one, MVs and moves of the other stretch of time."""
     colour = panels.run_colour(measured, controller)
-    for ax, cv in zip(rows[0], _cvs(measured), strict=True):
+    for ax, cv in zip(rows[0], panels.cv_names(measured), strict=True):
         panels.measured(ax, measured, controller, cv, MINUTE, "actual")
     for ax, below, mv in zip(rows[1], rows[2], ("choke", "gas_lift"), strict=True):
         panels.manipulated(ax, moved, controller, mv, MINUTE, legend=False)
@@ -179,7 +175,7 @@ def _six_panels(
     end = min(end, panels.span(data)[1])
     shown = _between(data, start, end)
     with style.grid(3, 2) as (drawn, rows):
-        for ax, cv in zip(rows[0], _cvs(data), strict=True):
+        for ax, cv in zip(rows[0], panels.cv_names(data), strict=True):
             panels.deadzone_lines(ax, shown, controller, cv, MINUTE)
             panels.setpoint(ax, shown, cv, MINUTE)
         for ax, mv in zip(rows[2], ("choke", "gas_lift"), strict=True):

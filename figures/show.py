@@ -178,7 +178,7 @@ def _study(study: str | Path | xr.Dataset) -> Panels:
 
 def _runs(data: xr.Dataset, controllers: Sequence[str]) -> Panels:
     """CVs with setpoint, then MVs; every controller in its colour."""
-    cvs, mvs = [str(name) for name in data.cv.values][::-1], [str(name) for name in data.mv.values]
+    cvs, mvs = panels.cv_names(data), [str(name) for name in data.mv.values]
     axes = _axes(len(cvs) + len(mvs), 1, width=7.6, height=1.7, sharex=True)
     seconds = panels.time_axis(axes[-1, 0], *panels.span(data))
     for name in controllers:

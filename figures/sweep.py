@@ -103,7 +103,7 @@ def draw_run(
 @contextlib.contextmanager
 def run(data: xr.Dataset, title: str) -> Iterator[Figure]:
     """The figure of `draw_run`, from results of one controller called ``run``."""
-    cvs = [str(cv) for cv in data.cv.values][::-1]
+    cvs = panels.cv_names(data)
     with style.figure(len(cvs) + 2, row_height=1.8) as (drawn, axes):
         drawn.suptitle(title, fontsize=10)
         seconds = panels.time_axis(

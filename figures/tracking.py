@@ -21,7 +21,7 @@ def rates(data: xr.Dataset, controller: str) -> Iterator[Figure]:
         data: results, whole or a stretch of time or of controllers.
         controller: name of a finished run.
     """
-    names = [str(name) for name in data.cv.values][::-1]  # oil above gas, as in the thesis
+    names = panels.cv_names(data)
     with _stack(data, controller, len(names)) as (drawn, axes, seconds):
         for ax, cv in zip(axes, names, strict=True):
             panels.controlled(ax, data, controller, cv, seconds)
@@ -47,7 +47,7 @@ def inputs(data: xr.Dataset, controller: str) -> Iterator[Figure]:
 @contextlib.contextmanager
 def bias(data: xr.Dataset, controller: str) -> Iterator[Figure]:
     """Filtered output bias of both CVs; arguments of `rates`."""
-    names = [str(name) for name in data.cv.values][::-1]
+    names = panels.cv_names(data)
     with _stack(data, controller, len(names)) as (drawn, axes, seconds):
         for ax, cv in zip(axes, names, strict=True):
             panels.bias(ax, data, controller, cv, seconds)

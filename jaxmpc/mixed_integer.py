@@ -167,8 +167,7 @@ class MixedIntegerControllers:
         certified = lambda values: np.where(good, values, np.nan)  # noqa: E731
         value, bound = (np.array([getattr(r, key) for r in results]) for key in ("value", "bound"))
         scale = self.scales_of(relaxer)[1]
-        with np.errstate(invalid="ignore"):
-            gap = np.maximum(value - bound, 0.0) / np.maximum(np.abs(value), 1e-6 * scale)
+        gap = relative_gap(value, bound, scale)
         seconds = np.array([r.seconds for r in results])
         wall = time.perf_counter() - begin - (self.solver.compiling - compiled)
         values: dict[str, Any] = dict(  # on the host: NumPy where the compiled controller has JAX arrays
@@ -220,6 +219,12 @@ class MixedIntegerControllers:
             self._packings["remembered"] = packing
         scales, packings = self.scales_of(relaxer)[0], (of_observed, packing)
         return packing.unpack(np.asarray(_remember(self.memory, scales, observed, x, good, packings)))
+
+
+def relative_gap(value: np.ndarray, bound: np.ndarray, scale) -> np.ndarray:
+    """Gap of certified plans, relative to their values, or to a small share of the problem's scale if these are zero."""
+    with np.errstate(invalid="ignore"):
+        return np.maximum(value - bound, 0.0) / np.maximum(np.abs(value), 1e-6 * scale)
 
 
 _FIELDS = [field.name for field in dataclasses.fields(StepInfo)]

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from jaxmpc import status as codes
 from jaxmpc.condense import QpInstance
 from jaxmpc.controller import ControllerState
-from jaxmpc.mixed_integer import MixedIntegerControllers, observed, remembered
+from jaxmpc.mixed_integer import MixedIntegerControllers, observed, relative_gap, remembered
 from jaxmpc.packing import Packing
 from jaxmpc.plant import WellPlant, WellState
 from jaxmpc.relaxer import Solved, relaxations
@@ -124,10 +124,8 @@ def simulate_in_strides(
             fields["solve_time"][done] += run.seconds
         if progress is not None:
             progress(min(done, total), total)
-    value, bound = fields["objective"], fields["bound"]
-    with np.errstate(invalid="ignore"):
-        least = 1e-6 * controllers.solver.relaxer(1).scenario(0).scale
-        fields["gap"] = np.maximum(value - bound, 0.0) / np.maximum(np.abs(value), least)
+    scale = controllers.solver.relaxer(1).scenario(0).scale
+    fields["gap"] = relative_gap(fields["objective"], fields["bound"], scale)
     return fields
 
 
@@ -164,8 +162,9 @@ class _Run:
     def start(self) -> Sample:
         """Before the first sample, everything compiled."""
         c, setpoints = self.controllers, self.inputs[0]
-        plant_state = jax.tree.map(lambda leaf: np.asarray(leaf)[None], self.plant.init())
-        outputs = self.plant.measure(self.plant.init())
+        steady = self.plant.init()
+        plant_state = jax.tree.map(lambda leaf: np.asarray(leaf)[None], steady)
+        outputs = self.plant.measure(steady)
         state = c.init(np.asarray(outputs.cv)[None], np.asarray(outputs.mv)[None])
         cv: Any = np.asarray(outputs.cv)[None] + self.inputs[2][:1]
         memory, qps, rows, columns, *_ = self.constants

@@ -42,11 +42,7 @@ def _definition(
     duration: float,
     **more: Any,
 ) -> ComparisonDefinition:
-    reference = ReferenceDefinition(
-        tuple(float(row[0]) for row in windows),
-        tuple((float(row[1]), float(row[2])) for row in windows),
-        float(duration),
-    )
+    reference = ReferenceDefinition.of(references.from_windows(windows, duration))
     name, title = f"{name}-{'quick-' if quick else ''}{plant}", title + (", shortened" if quick else "")
     return ComparisonDefinition(name, title, plant, controllers, reference, **more)
 

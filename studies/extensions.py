@@ -28,14 +28,6 @@ LONGEST = 1.0  # s, of a step with window rows: a few of them would take minutes
 TIME_LIMITS = (0.005, 0.01, 0.05)  # s
 
 
-def _reference(windows, duration: float) -> ReferenceDefinition:
-    return ReferenceDefinition(
-        tuple(float(row[0]) for row in windows),
-        tuple(tuple(float(v) for v in row[1:]) for row in windows),
-        duration,
-    )
-
-
 def _windows(quick: bool) -> ReferenceDefinition:
     return ReferenceDefinition.of(references.quick() if quick else references.thesis())
 
@@ -71,7 +63,11 @@ def gain_scheduling(quick: bool = False, plant: PlantKind = "fmu") -> Comparison
                 schedule=schedule,
             )
         )
-    reference = _reference(NEAR_CLOSED_WINDOWS, NEAR_CLOSED_DURATION) if quick else _windows(False)
+    reference = (
+        ReferenceDefinition.of(references.from_windows(NEAR_CLOSED_WINDOWS, NEAR_CLOSED_DURATION))
+        if quick
+        else _windows(False)
+    )
     named = _named("gain-scheduling", "Gain scheduling", quick, plant)
     return ComparisonDefinition(**named, controllers=tuple(controllers), reference=reference)
 

@@ -6,7 +6,7 @@ that knows nothing of the step choke then hunts between the two.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from jaxmpc.reference import Reference
 
@@ -40,33 +40,34 @@ NEARLY_CLOSED_WINDOWS = ((0, 6995, 133), (6000, 5870, 100.6), (12000, 5445, 88))
 REGION_DURATION = 18_000.0
 
 
-def _reference(windows, duration: float) -> Reference:
+def from_windows(windows: Sequence[Sequence[float]], duration: float) -> Reference:
+    """A reference from rows of start [s] and one setpoint per CV."""
     return Reference([row[0] for row in windows], [row[1:] for row in windows], duration)
 
 
 def thesis() -> Reference:
     """The thesis run: 13 windows of 6,000 s, 7,800 samples of 10 s; CV order gas, oil [m3/h]."""
-    return _reference(THESIS_WINDOWS, THESIS_DURATION)
+    return from_windows(THESIS_WINDOWS, THESIS_DURATION)
 
 
 def quick() -> Reference:
     """Three windows, 1,200 samples of 10 s, that show the same effects; CV order gas, oil [m3/h]."""
-    return _reference(QUICK_WINDOWS, QUICK_DURATION)
+    return from_windows(QUICK_WINDOWS, QUICK_DURATION)
 
 
 def wide_open() -> Reference:
     """Three targets with the choke at 70 % and more, 1,800 samples of 10 s; CV order gas, oil [m3/h]."""
-    return _reference(WIDE_OPEN_WINDOWS, REGION_DURATION)
+    return from_windows(WIDE_OPEN_WINDOWS, REGION_DURATION)
 
 
 def mid_choke() -> Reference:
     """Three targets with the choke at 30 to 51 %, 1,800 samples of 10 s; CV order gas, oil [m3/h]."""
-    return _reference(MID_CHOKE_WINDOWS, REGION_DURATION)
+    return from_windows(MID_CHOKE_WINDOWS, REGION_DURATION)
 
 
 def nearly_closed() -> Reference:
     """Three targets with the choke at 19 % down to 7 %, 1,800 samples of 10 s; CV order gas, oil [m3/h]."""
-    return _reference(NEARLY_CLOSED_WINDOWS, REGION_DURATION)
+    return from_windows(NEARLY_CLOSED_WINDOWS, REGION_DURATION)
 
 
 # What a study definition calls them.
