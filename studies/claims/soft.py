@@ -41,7 +41,8 @@ def _lasting(run: xr.Dataset) -> np.ndarray:
 
 def _said(run: xr.Dataset) -> str:
     counts = turns_by_window(run)
-    return f"{int(counts.sum())} reversals, up to {int(counts.max())} in a window"
+    total = int(counts.sum())
+    return f"{total} reversal{'s' if total != 1 else ''}, up to {int(counts.max())} in a window"
 
 
 def _oscillates(role: str) -> Callable[[Evidence], Finding]:
@@ -71,22 +72,21 @@ def _oscillates(role: str) -> Callable[[Evidence], Finding]:
 def _removes(hard: str) -> Callable[[Evidence], Finding]:
     def measure(evidence: Evidence) -> Finding:
         run = evidence.run("soft")
-        counts, lasting = turns_by_window(run), _lasting(run)
-        value = (
-            f"with Soft MPC {_said(run)}, {int(lasting.sum())} in second halves; without {_said(evidence.run(hard))}, "
-            f"{int(_lasting(evidence.run(hard)).sum())} in second halves"
-        )
-        if turns_by_window(evidence.run(hard)).max() < HUNTING:
+        counts, without = turns_by_window(run), turns_by_window(evidence.run(hard))
+        value = f"with Soft MPC {_said(run)}; without {_said(evidence.run(hard))}"
+        if without.max() < HUNTING:
             return Finding(value, ())
-        turned = turns(run)
-        worst = np.flatnonzero(turned & (run.window.values == counts.argmax()))
-        words = "its swings last"
-        if not lasting.any() and worst.size:
-            begin = np.flatnonzero(run.window.values == counts.argmax())[0]
-            after = float(run.time.values[worst[-1]] - run.time.values[begin])
-            words = f"it turns {worst.size} times, the last {after:.0f} s after the step of the setpoints, and then rests"
-        quiet = np.bincount(run.window.values[lasting], minlength=1).max() < HUNTING
-        return Finding(value, (bool(quiet), bool(counts.max() < HUNTING)), words)
+        worst = np.flatnonzero(run.window.values == counts.argmax())
+        last = worst[turns(run)[worst]]
+        words = ""
+        if last.size:
+            after = float(run.time.values[last[-1]] - run.time.values[worst[0]])
+            rest = float(run.time.values[worst[-1]] - run.time.values[last[-1]])
+            words = (
+                f"in the {evidence.starts(np.arange(len(counts)) == counts.argmax())} it still turns {last.size} times, "
+                f"the last {after:.0f} s after the step of the setpoints, {rest:.0f} s before the end of the window"
+            )
+        return Finding(value, (bool(counts.max() < HUNTING),), words)
 
     return measure
 
@@ -168,10 +168,7 @@ OSCILLATES = (
     "halves of windows (in part: some of the three)"
 )
 
-REMOVED = (
-    f"with Soft MPC fewer than {HUNTING} in every second half of a window, and in every whole window (in part: in every "
-    f"second half); {HUNTING} or more in a window without"
-)
+REMOVED = f"with Soft MPC fewer than {HUNTING} in every window, and without it {HUNTING} or more in one"
 
 ROWS = (
     Row(
