@@ -65,7 +65,7 @@ def scheduling(data: xr.Dataset) -> Iterator[Figure]:
             panels.deadzone_lines(rate, zoom, pair[0], OIL, seconds)
             panels.setpoint(rate, zoom, OIL, seconds)
             rate.set_title(title)
-            choke.legend(loc="upper right", ncols=2)
+            rate.legend(loc="upper right", ncols=2)
         for row in (0, 1):
             axes[row, 1].sharey(axes[row, 0])
             axes[row, 1].set_ylabel("")
@@ -139,7 +139,7 @@ def mean_move(data: xr.Dataset) -> Iterator[Figure]:
             choke.set_title(f"{kind} MPC")
             choke.ticklabel_format(useOffset=False)
             choke.legend(loc="best")
-            mean.legend(loc="center right")
+            panels.legend_above(mean)
             if column:
                 choke.set_ylabel("")
         yield drawn
@@ -205,6 +205,32 @@ def _numbers(axes: Axes, place, values: Sequence[float], form: str) -> None:
         axes.text(x, value, form.format(value), ha="center", va="bottom", fontsize=8)
 
 
+def _scheduling_caption(data: xr.Dataset) -> str:
+    late = key_figures(data).late_reversals.sum("window")
+    pairs = (("with Soft MPC", SOFT_PAIR), ("without", HARD_PAIR), ("rounded", ROUNDED_PAIR))
+    counts = "; ".join(
+        f"{words} {int(late.sel(controller=one))} and {int(late.sel(controller=two))}"
+        for words, (one, two) in pairs
+    )
+    return (
+        "One model from half open underestimates what the choke does near closed several times over. Reversals in the "
+        f"second halves of the windows with one model and with a schedule: {counts}. Rounding hunts for another reason."
+    )
+
+
+def _mean_move_caption(data: xr.Dataset) -> str:
+    largest = key_figures(data).largest_mean_opening
+    kinds = "; ".join(
+        f"{kind} MPC {float(largest.sel(controller=f'{kind}-reactive')):.3f} and "
+        f"{float(largest.sel(controller=f'{kind}-predictive')):.3f}"
+        for kind in ("continuous", "mixed-integer")
+    )
+    return (
+        "The reactive limit stops the choke once the mean of its moves is above the limit; the predictive limit plans with "
+        f"the windows. Largest mean of the run, reactive and predictive: {kinds} %/sample."
+    )
+
+
 ENTRIES = (
     FigureEntry(
         "gain-scheduling",
@@ -213,10 +239,7 @@ ENTRIES = (
         "gain_scheduling",
         scheduling,
         (*SOFT_PAIR, *HARD_PAIR, *ROUNDED_PAIR),
-        caption=(
-            "One model from half open underestimates what the choke does near closed several times over. With a schedule "
-            "the mixed-integer controllers stay at one position, with and without Soft MPC; rounding hunts all the same."
-        ),
+        caption=_scheduling_caption,
         alt="Oil rate and choke over time in two columns, with and without Soft MPC; below, bars of reversals per window.",
     ),
     FigureEntry(
@@ -231,10 +254,7 @@ ENTRIES = (
             "mixed-integer-reactive",
             "mixed-integer-predictive",
         ),
-        caption=(
-            "The reactive limit stops the choke once the mean of its moves is above the limit, so that the mean goes over; "
-            "the predictive limit plans with the windows and never does."
-        ),
+        caption=_mean_move_caption,
         alt="Two columns, continuous and mixed-integer MPC: choke position above the windowed mean of its moves.",
     ),
     FigureEntry(

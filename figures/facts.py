@@ -12,9 +12,12 @@ LATE = 600.0  # s at the end of a stretch that stand for what it settles at
 
 
 def choke_moves(data: xr.Dataset, controller: str) -> np.ndarray:
-    """Moves of the actual choke position, ``"sample"`` [%]; none in the first sample of `data`."""
-    position = data.position.sel(controller=controller, mv=CHOKE).values
-    return np.diff(position, prepend=position[:1])
+    """Moves of the actual choke position, ``"sample"`` [%]; none in the first sample of a part of a run."""
+    run = data.sel(controller=controller, mv=CHOKE)
+    position = run.position.values
+    whole = float(data.time.values[0]) == 0.0
+    start = run.demand.values[0] - run.move.values[0] if whole else position[0]  # as in the key figures
+    return np.asarray(kpi.moves_of(position, start))
 
 
 def reversals(data: xr.Dataset, controller: str) -> int:

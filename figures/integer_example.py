@@ -85,8 +85,8 @@ def point_text(point: Point) -> str:
 
 
 MARKS = {  # of an optimum: name, function, marker, colour, place of its label [points]
-    "relaxed": ("optimum of the relaxation", example.relaxed_optimum, "s", style.BLUE, (9, 12)),
-    "rounded": ("rounded to a feasible point", example.rounded, "D", style.ORANGE, (9, -13)),
+    "relaxed": ("optimum of the relaxation", example.relaxed_optimum, "s", style.BLUE, (18, 11)),
+    "rounded": ("rounded to a feasible point", example.rounded, "D", style.ORANGE, (-12, -17)),
     "integer": ("integer optimum", example.optimum, "*", style.GREEN, (7, 8)),
 }
 

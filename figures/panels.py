@@ -10,6 +10,7 @@ from matplotlib.ticker import MaxNLocator
 from figures import style
 
 HOUR = 3600.0
+SAME = 1e-6  # MV units between a demand and a position that are one line
 
 
 def run_of(data: xr.Dataset, controller: str) -> xr.Dataset:
@@ -147,12 +148,13 @@ def manipulated(
     label: str = "actual",
     colour: str | None = None,
 ) -> None:
-    """An MV as the actuator holds it over each sample, with the controller's demand if asked for."""
+    """An MV as the actuator holds it over each sample, with the controller's demand if asked for and not the same."""
     run = run_of(data, controller).sel(mv=mv)
     t = _ends(data) / seconds
     colour = colour or run_colour(data, controller)
     width = _width(data)
-    if demand:
+    apart = demand and bool(np.abs(run.demand.values - run.position.values).max() > SAME)
+    if apart:
         axes.step(
             t,
             _held(run.demand.values),
@@ -161,6 +163,7 @@ def manipulated(
             linewidth=0.6 * width,
             label="demanded",
         )
+    label = "demanded and actual" if demand and not apart else label
     axes.step(t, _held(run.position.values), where="post", color=colour, linewidth=width, label=label)
     axes.set_ylabel(style.label(mv, str(run.mv_unit.item())))
     if legend and demand:

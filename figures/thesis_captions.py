@@ -125,7 +125,7 @@ def solve_time(controllers: tuple[str, ...]) -> Callable[[xr.Dataset], str]:
             len(np.unique(data.solve_time.sel(controller=name).values)) < data.sizes["time"] / 10
             for name in controllers
         )
-        note = " A continuous controller on the JAX well runs compiled, so its times are means over many samples."
+        note = " On the JAX well samples run compiled, many at once; each has their mean time."
         return (
             f"Median and longest time of one step: {', '.join(parts)}; the sampling interval is "
             f"{float(data.attrs['dt']):.0f} s.{note if compiled else ''}"
