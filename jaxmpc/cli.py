@@ -178,20 +178,14 @@ def _study_comparison(options: argparse.Namespace, plant) -> int:
         folder = run_rto(*asked)
         draw_rto(folder)
     else:
+        from figures.comparison import draw_all
         from studies.catalogue import run_named
+        from studies.report import write_summary
 
         folder = run_named(options.study, *asked)
-        if options.study == "thesis":
-            from figures.thesis import draw_all
-
-            draw_all(folder)
-            print(f"Summary: {folder / 'summary.md'}, figures: {folder / 'figures'}")
-            return EXIT_OPTIMAL
-        from figures.registry import FIGURES, draw
-
-        ids = [id for id, entry in FIGURES.items() if entry.study == options.study]
-        draw(ids, folder, folder / "figures")
-    print(f"Results: {folder}, figures: {folder / 'figures'}")
+        draw_all(folder, options.study)
+        write_summary(folder, options.study)
+    print(f"Summary: {folder / 'summary.md'}, figures: {folder / 'figures'}")
     return EXIT_OPTIMAL
 
 

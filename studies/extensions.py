@@ -1,13 +1,13 @@
 """Comparisons beyond the thesis: gain scheduling (its chapter 8), a mean-move limit that looks ahead, limited solve times.
 
-`STUDIES` has the same form as that of `studies.catalogue`. `objective_loss` measures what a time limit cost the plans of a
-stored run, against the exact optimum of the very same steps.
+`STUDIES` has the same form as that of `studies.catalogue`. `limited_steps` measures what time limits cost the plans of
+stored runs, against the exact optimum of the very same steps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Literal
+from collections.abc import Callable, Iterable
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -120,6 +120,47 @@ STUDIES: dict[str, Callable[[bool, PlantKind], ComparisonDefinition]] = {
     "mean-move": mean_move,
     "time-limit": time_limit,
 }
+
+
+class LimitedSteps(NamedTuple):
+    """The steps of a run that ended at their time limit.
+
+    Attributes:
+        label: of the controller.
+        share: of all steps, 0..1.
+        gap: median of the relative gaps that were proven.
+        lost: relative to the exact optimum of the same step, the median, the 90th percentile and the most.
+    """
+
+    label: str
+    share: float
+    gap: float
+    lost: tuple[float, float, float]
+
+
+def limited_steps(
+    data: xr.Dataset, definitions: Iterable[ControllerDefinition], model: StepResponseModel
+) -> list[LimitedSteps]:
+    """What the time limits of stored runs cost, one entry per controller with a limit; NaN where no step reached it.
+
+    Args:
+        data: results from `studies.store.open_results`, every run finished.
+        definitions: of the controllers that ran.
+        model: their prediction model, ``model.json`` in the folder of the study.
+    """
+    out = []
+    for definition in definitions:
+        if definition.time_limit is None:
+            continue
+        run = data.sel(controller=definition.name)
+        at = run.status.values == LIMIT
+        gap, lost = np.nan, (np.nan, np.nan, np.nan)
+        if at.any():
+            loss = objective_loss(data, definition, model)[at]
+            gap = float(np.median(run.gap.values[at]))
+            lost = float(np.nanmedian(loss)), float(np.nanpercentile(loss, 90)), float(np.nanmax(loss))
+        out.append(LimitedSteps(definition.label, float(at.mean()), gap, lost))
+    return out
 
 
 def objective_loss(

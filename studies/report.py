@@ -1,16 +1,44 @@
-"""The one-page summary of a comparison as rows of text, Markdown and CSV; `figures.summary` draws it."""
+"""The summary of a comparison as rows of text, Markdown and CSV; `figures.summary` draws that of the thesis study."""
 
 from __future__ import annotations
 
 import csv
 import io
+from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
+from jaxmpc.files import write_atomically
+from jaxmpc.step_response import StepResponseModel
 from studies.claims import claims
 from studies.evaluate import key_figures
+from studies.extensions import LimitedSteps, limited_steps, time_limit
 from studies.presets import GAS, OIL
+from studies.store import open_results
+
+
+def write_summary(folder: str | Path, study: str) -> list[Path]:
+    """Write the key figures of every run of a study as ``summary.md`` and ``summary.csv`` beside its results.
+
+    Args:
+        folder: of the study, with a finished run.
+        study: a key of `studies.catalogue.STUDIES`. The Markdown of ``thesis`` has its statements too, that of
+            ``time-limit`` what the limits cost, for which the limited steps are solved again.
+
+    Returns:
+        The files written.
+    """
+    folder = Path(folder)
+    data = open_results(folder).load()
+    text = markdown(data, statements=study == "thesis")
+    if study == "time-limit":
+        model = StepResponseModel.load(folder / "model.json")
+        text += "\n" + limits_markdown(limited_steps(data, time_limit().controllers, model))
+    return [
+        write_atomically(folder / "summary.md", text),
+        write_atomically(folder / "summary.csv", table_csv(data)),
+    ]
 
 
 def summary_table(figures: xr.Dataset) -> list[tuple[str, list[str]]]:
@@ -45,21 +73,47 @@ def _run_texts(run: xr.Dataset) -> dict[str, str]:
         "limit violations, CV / MV / move [samples]": " / ".join(violations),
         "largest mean opening [%/sample]": f"{value('largest_mean_opening'):.3f}",
         "pauses of the staircase": f"{value('mean_move_stops'):.0f}",
-        "solve time, median / p99 / max [ms]": f"{times[0]:.2f} / {times[1]:.1f} / {times[2]:.0f}",
+        "solve time, median / p99 / max [ms]": " / ".join(_three_digits(t) for t in times),
         "largest gap": f"{gap:.2g}" if np.isfinite(gap) else "none proven",
         "not optimal / MVs held [samples]": f"{value('not_optimal'):.0f} / {value('fallbacks'):.0f}",
     }
 
 
-def markdown(data: xr.Dataset) -> str:
-    """The summary as Markdown: key figures per controller, then the statements with their verdicts."""
+def _three_digits(value: float) -> str:
+    """A positive number with about three digits and never with an exponent."""
+    return (
+        f"{value:.{max(0, 2 - int(np.floor(np.log10(value))))}f}" if 1e-3 < value < np.inf else f"{value:.0f}"
+    )
+
+
+def markdown(data: xr.Dataset, statements: bool = True) -> str:
+    """The summary as Markdown: key figures per controller, then the statements of the thesis with their verdicts.
+
+    Args:
+        data: results with a finished run.
+        statements: whether the runs are those of the thesis study, which its statements are about.
+    """
     figures = key_figures(data)
     labels = [str(v) for v in figures.label.values]
     lines = [f"# {data.attrs.get('title', 'Summary')}", ""]
     lines += ["| | " + " | ".join(labels) + " |", "|---|" + "---|" * len(labels)]
     lines += [f"| {what} | " + " | ".join(values) + " |" for what, values in summary_table(figures)]
-    lines += ["", "| the thesis says | what we see | verdict | holds if |", "|---|---|---|---|"]
-    lines += [f"| {c.statement} | {c.value} | {c.verdict} | {c.rule} |" for c in claims(data, figures)]
+    if statements:
+        lines += ["", "| the thesis says | what we see | verdict | holds if |", "|---|---|---|---|"]
+        lines += [f"| {c.statement} | {c.value} | {c.verdict} | {c.rule} |" for c in claims(data, figures)]
+    return "\n".join([*lines, ""])
+
+
+def limits_markdown(rows: list[LimitedSteps]) -> str:
+    """What limited solve times cost as a Markdown table, one row per controller; percent of the exact optimum."""
+    lines = [
+        "| | steps that reach their limit | proven gap, median | objective lost: median / 90 % / most |",
+        "|---|---|---|---|",
+    ]
+    for row in rows:
+        lost = " / ".join(f"{100 * value:.2g}" for value in row.lost)
+        known = f"{100 * row.gap:.2g} % | {lost} %" if row.share > 0 else " | "
+        lines.append(f"| {row.label} | {100 * row.share:.1f} % | {known} |")
     return "\n".join([*lines, ""])
 
 

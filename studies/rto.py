@@ -21,6 +21,7 @@ from identify.steady_map import steady_map
 from identify.step_test import identify_step_response
 from jaxmpc.closed_loop import simulate
 from jaxmpc.errors import InputError
+from jaxmpc.files import write_atomically
 from jaxmpc.mixed_integer import MixedIntegerController
 from jaxmpc.reference import Reference
 from jaxmpc.rto import LIFT_RANGES, Targets, optimise
@@ -31,7 +32,7 @@ from studies.comparison import closing, progress_bar
 from studies.definition import PLANTS, PlantKind
 from studies.fingerprint import content_hash, module_hash, source_hash, versions
 from studies.presets import CHOKE, GAS, LIFT, OIL
-from studies.store import ResultStore, check_writable, locked, results_template
+from studies.store import ResultStore, check_writable, locked, open_results, results_template
 from studies.thesis import plant_factory
 
 WITHOUT, WITH = "without-rto", "with-rto"
@@ -45,6 +46,7 @@ WINDOWS = (
 )
 DURATION, QUICK_DURATION = 28_800.0, 12_000.0  # s; the quick run ends before the third window
 PRICES = {GAS: 0.1, OIL: 400.0, LIFT: 0.3}  # per m3
+SETTLED = 300.0  # s at the end of a window that stand for where a run settles
 TARGET_WEIGHT = {CHOKE: 1.0, LIFT: 1e-3}  # 1/(%)^2, 1/(m3/h)^2
 
 
@@ -87,8 +89,8 @@ def run_rto(
         say: receives one line per event.
 
     Returns:
-        The folder of the study, with ``results.zarr`` (see `studies.store.open_results`), ``model.json`` and
-        ``steady_map.json``.
+        The folder of the study, with ``results.zarr`` (see `studies.store.open_results`), ``model.json``,
+        ``steady_map.json`` and ``summary.md``, where both runs settle.
 
     Raises:
         InputError: for an unknown plant or a folder that cannot be written, before anything is computed.
@@ -174,7 +176,37 @@ def run_rto(
             wall_time = time.perf_counter() - started
             store.write(name, run, wall_time)
             say(f"{label}: {run.samples} samples in {wall_time:.1f} s.")
+    write_atomically(folder / "summary.md", markdown(open_results(folder).load()))
     return folder
+
+
+def markdown(data: xr.Dataset) -> str:
+    """Where both runs settle for each demand as a Markdown table: means over the last `SETTLED` seconds of its window.
+
+    Args:
+        data: results of `run_rto`, both runs finished.
+    """
+    lines = [
+        f"# {data.attrs['title']}",
+        "",
+        "| gas / oil demanded [m3/h] | run | choke [%] | lift [m3/h] | gas / oil off the demand [m3/h] | in the deadzones |",
+        "|---|---|---|---|---|---|",
+    ]
+    window, half = data.window.values, data.tuning_deadzone.isel(controller=0)
+    samples = round(SETTLED / float(data.attrs["dt"]))
+    for w in range(int(window.max()) + 1):
+        end = data.isel(time=np.flatnonzero(window == w)[-samples:])
+        rates = end.demanded.isel(time=-1)
+        for name in data.controller.values:
+            run = end.sel(controller=name)
+            off = (run.measurement - rates).mean("time")
+            choke, lift = (float(run.position.sel(mv=mv).mean()) for mv in (CHOKE, LIFT))
+            inside = "yes" if bool((np.abs(off) <= half).all()) else "no"
+            lines.append(
+                f"| {float(rates.sel(cv=GAS)):.0f} / {float(rates.sel(cv=OIL)):.0f} | {run.label.item()} | {choke:.1f} | "
+                f"{lift:.0f} | {float(off.sel(cv=GAS)):+.0f} / {float(off.sel(cv=OIL)):+.1f} | {inside} |"
+            )
+    return "\n".join([*lines, ""])
 
 
 def _shared(

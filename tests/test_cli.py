@@ -301,9 +301,10 @@ def test_identify_refuses_a_working_point_outside_the_well(tmp_path, capsys):
 def test_the_thesis_study_gets_its_options_and_bad_ones_are_reported(stub, tmp_path, capsys):
     given = []
     stub("studies.catalogue", run_named=lambda *options: given.append(options) or tmp_path / "r" / "thesis")
-    stub("figures.thesis", draw_all=given.append)
+    stub("figures.comparison", draw_all=lambda *options: given.append(options))
+    stub("studies.report", write_summary=lambda *options: given.append(options))
     assert main(["study", "run", "thesis", "--out", str(tmp_path / "r"), "--quick", "--plant", "jax"]) == 0
-    assert given == [("thesis", tmp_path / "r", True, "jax"), tmp_path / "r" / "thesis"]
+    assert given == [("thesis", tmp_path / "r", True, "jax"), *2 * [(tmp_path / "r" / "thesis", "thesis")]]
     assert str(tmp_path / "r" / "thesis" / "summary.md") in capsys.readouterr().out
 
     def refuse(*_):
@@ -320,17 +321,6 @@ def test_every_study_of_the_catalogue_can_be_named_on_the_command_line():
     from studies.catalogue import STUDIES
 
     assert set(STUDIES) <= set(COMPARISONS)
-
-
-def test_a_comparison_draws_its_figures_beside_its_results(stub, tmp_path, capsys):
-    given = []
-    stub("studies.catalogue", run_named=lambda *options: given.append(options) or tmp_path / "r" / "soft")
-    entries = {"12": SimpleNamespace(study="soft"), "14": SimpleNamespace(study="thesis")}
-    stub("figures.registry", draw=lambda *options: given.append(options), FIGURES=entries)
-    assert main(["study", "run", "soft", "--out", str(tmp_path / "r")]) == 0
-    folder = tmp_path / "r" / "soft"
-    assert given == [("soft", tmp_path / "r", False, "fmu"), (["12"], folder, folder / "figures")]
-    assert str(folder / "figures") in capsys.readouterr().out
 
 
 def test_figures_are_listed_without_an_id_and_produced_with_one(stub, tmp_path, capsys):

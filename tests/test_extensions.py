@@ -16,7 +16,7 @@ from jaxmpc.errors import InputError
 from jaxmpc.mixed_integer import MixedIntegerController
 from jaxmpc.plant import WellPlant
 from jaxmpc.tuning import make_tuning
-from studies import catalogue, comparison, extensions, presets
+from studies import catalogue, comparison, extensions, presets, report
 from studies.definition import ComparisonDefinition, ControllerDefinition, ReferenceDefinition
 from studies.store import open_results
 
@@ -177,6 +177,21 @@ def test_a_limited_step_loses_no_less_than_nothing_and_no_more_than_its_gap(resu
     assert (loss[~limited] == 0).all()
     assert (loss[limited] >= 0).all()
     assert (loss[limited] <= gap / (1.0 - gap) + 1e-5).all()
+
+
+def test_the_table_of_limits_has_one_row_per_limited_controller(results, model):
+    definition, data = results
+    (row,) = extensions.limited_steps(data, definition.controllers, model)
+    limited = data.sel(controller="hurried").status.values == status.LIMIT
+    loss = extensions.objective_loss(data, definition.controllers[1], model)[limited]
+    assert (row.label, row.share) == ("hurried", pytest.approx(limited.mean()))
+    assert row.lost[0] == pytest.approx(np.median(loss))
+    assert row.lost[0] <= row.lost[1] <= row.lost[2] == pytest.approx(loss.max())
+    solved = data.assign(status=data.status * 0)
+    (none,) = extensions.limited_steps(solved, definition.controllers, model)
+    text = report.limits_markdown([row, none]).splitlines()
+    assert text[2].startswith(f"| hurried | {100 * row.share:.1f} % | ")
+    assert text[3] == "| hurried | 0.0 % |  |  |"
 
 
 def test_a_controller_with_a_schedule_runs_differently_and_is_stored_under_another_hash(results):

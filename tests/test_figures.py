@@ -4,8 +4,7 @@ import matplotlib
 import numpy as np
 import pytest
 
-import figures.thesis
-from figures import closeup, panels, registry, style, tracking
+from figures import closeup, comparison, panels, registry, style, tracking
 from jaxmpc.errors import InputError
 from studies.store import ResultStore, open_results
 from tests import studies_synthetic as made
@@ -21,13 +20,13 @@ def results(tmp_path_factory):
     return folder
 
 
-def test_every_thesis_figure_is_drawn_as_png_and_pdf_with_the_summary(results):
-    paths = figures.thesis.draw_all(results)
+def test_every_thesis_figure_is_drawn_as_png_and_pdf(results):
+    paths = comparison.draw_all(results, "thesis")
     names = {path.name for path in paths}
     for number in [10, 11, *range(14, 25)]:
         for kind in ("png", "pdf"):
             assert any(n.startswith(f"figure_{number}_") and n.endswith(kind) for n in names), (number, kind)
-    assert {"summary.png", "summary.pdf", "summary.md", "summary.csv"} <= names
+    assert {"summary.png", "summary.pdf"} <= names
     assert all(path.stat().st_size > 1000 for path in paths)
     assert matplotlib.get_backend().lower() == "agg"
 

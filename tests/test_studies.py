@@ -16,12 +16,17 @@ from tests import studies_synthetic as made
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory):
+def stored(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made-up")
     store = ResultStore.begin(folder, list(made.RUNS), "study", made.template, lambda line: None)
     for name, kind in made.RUNS.items():
         store.write(name, made.trajectory(kind), 1.0)
-    return open_results(folder).load()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def results(stored):
+    return open_results(stored).load()
 
 
 # presets
@@ -322,6 +327,16 @@ def test_the_report_holds_every_controller_and_claim(results):
         "gas_rate",
         "oil_rate",
     }
+
+
+@pytest.mark.parametrize(("study", "statements"), [("thesis", True), ("soft", False)])
+def test_the_summary_of_a_study_lies_beside_its_results(stored, results, study, statements):
+    paths = report.write_summary(stored, study)
+    assert paths == [stored / "summary.md", stored / "summary.csv"]
+    text = paths[0].read_text()
+    assert "| choke travel [%] | " in text
+    assert ("the thesis says" in text) == statements
+    assert paths[1].read_text() == report.table_csv(results)
 
 
 def test_results_without_a_finished_run_are_refused():

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-import figures.thesis
+from figures import comparison
+from figures.registry import FIGURES
 from studies import claims, evaluate, thesis
 from studies.store import open_results
 
@@ -42,8 +43,8 @@ def test_the_quick_study_shows_what_the_thesis_shows(quick):
 @pytest.mark.slow
 def test_every_figure_is_drawn_and_a_rerun_computes_nothing(quick):
     folder, _ = quick
-    paths = figures.thesis.draw_all(folder)
-    assert len(paths) == 2 * len(figures.thesis.FIGURES) + 2
+    paths = comparison.draw_all(folder, "thesis")
+    assert len(paths) == 2 * sum(entry.study == "thesis" for entry in FIGURES.values())
     lines = []
     thesis.run_thesis(folder.parent, quick=True, plant="jax", progress=False, say=lines.append)
     assert sum("stored already" in line for line in lines) == 3
