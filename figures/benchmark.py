@@ -81,7 +81,7 @@ def time_per_sample(series: dict[str, Any]) -> Iterator[Figure]:
                     color=style.BLACK,
                     linewidth=0.9,
                     linestyle=line,
-                    label=style.printed(f"{word}: {_milliseconds(value)} ms"),
+                    label=style.printed(f"{word}: {two_digits(value)} ms"),
                 )
             ax.set_yscale("log")
             ax.set_ylabel("time per sample [ms]")
@@ -91,7 +91,7 @@ def time_per_sample(series: dict[str, Any]) -> Iterator[Figure]:
         yield drawn
 
 
-def _milliseconds(value: float) -> str:
+def two_digits(value: float) -> str:
     """Two digits, and no power of ten for a hundred and more."""
     return f"{value:,.0f}" if value >= 99.5 else f"{value:.2g}"
 

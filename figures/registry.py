@@ -7,7 +7,7 @@ from pathlib import Path
 
 import xarray as xr
 
-from figures import extensions, scenario_entries, style, thesis_entries
+from figures import extensions, scenario_entries, style, thesis_entries, unblocked
 from figures.entry import FigureEntry
 from jaxmpc.errors import InputError
 from studies.evaluate import completed
@@ -20,7 +20,9 @@ def _order(entry: FigureEntry) -> tuple[bool, int]:
 
 FIGURES: dict[str, FigureEntry] = {
     entry.id: entry
-    for entry in sorted([*thesis_entries.ENTRIES, *scenario_entries.ENTRIES, *extensions.ENTRIES], key=_order)
+    for entry in sorted(
+        [*thesis_entries.ENTRIES, *scenario_entries.ENTRIES, unblocked.ENTRY, *extensions.ENTRIES], key=_order
+    )
 }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import xarray as xr
@@ -112,6 +112,17 @@ def oscillating_inputs(controller: str) -> Callable[[xr.Dataset], str]:
     return text
 
 
+def compiled_note(data: xr.Dataset, controllers: Iterable[str]) -> str:
+    """What to know of times per sample where compiled loops have none of their own; empty otherwise."""
+    compiled = any(
+        len(np.unique(data.solve_time.sel(controller=name).values)) < data.sizes["time"] / 10
+        for name in controllers
+    )
+    return (
+        " On the JAX well samples run compiled, many at once; each has their mean time." if compiled else ""
+    )
+
+
 def solve_time(controllers: tuple[str, ...]) -> Callable[[xr.Dataset], str]:
     """Figure 39."""
 
@@ -121,14 +132,9 @@ def solve_time(controllers: tuple[str, ...]) -> Callable[[xr.Dataset], str]:
             ms = 1e3 * data.solve_time.sel(controller=name).values
             kind = str(data.kind.sel(controller=name).item())
             parts.append(f"{kind} MPC {np.median(ms):.1f} / {ms.max():.0f} ms")
-        compiled = any(
-            len(np.unique(data.solve_time.sel(controller=name).values)) < data.sizes["time"] / 10
-            for name in controllers
-        )
-        note = " On the JAX well samples run compiled, many at once; each has their mean time."
         return (
             f"Median and longest time of one step: {', '.join(parts)}; the sampling interval is "
-            f"{float(data.attrs['dt']):.0f} s.{note if compiled else ''}"
+            f"{float(data.attrs['dt']):.0f} s.{compiled_note(data, controllers)}"
         )
 
     return text

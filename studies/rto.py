@@ -189,7 +189,7 @@ def markdown(data: xr.Dataset) -> str:
     lines = [
         f"# {data.attrs['title']}",
         "",
-        "| gas / oil demanded [m3/h] | run | choke [%] | lift [m3/h] | gas / oil off the demand [m3/h] | in the deadzones |",
+        "| gas / oil demanded [m3/h] | run | choke [%] | lift [m3/h] | gas / oil off the demand [m3/h] | half widths off |",
         "|---|---|---|---|---|---|",
     ]
     window, half = data.window.values, data.tuning_deadzone.isel(controller=0)
@@ -201,10 +201,10 @@ def markdown(data: xr.Dataset) -> str:
             run = end.sel(controller=name)
             off = (run.measurement - rates).mean("time")
             choke, lift = (float(run.position.sel(mv=mv).mean()) for mv in (CHOKE, LIFT))
-            inside = "yes" if bool((np.abs(off) <= half).all()) else "no"
+            far = float((np.abs(off) / half).max())
             lines.append(
                 f"| {float(rates.sel(cv=GAS)):.0f} / {float(rates.sel(cv=OIL)):.0f} | {run.label.item()} | {choke:.1f} | "
-                f"{lift:.0f} | {float(off.sel(cv=GAS)):+.0f} / {float(off.sel(cv=OIL)):+.1f} | {inside} |"
+                f"{lift:.0f} | {float(off.sel(cv=GAS)):+.0f} / {float(off.sel(cv=OIL)):+.1f} | {far:.2f} |"
             )
     return "\n".join([*lines, ""])
 
