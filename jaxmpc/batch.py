@@ -94,7 +94,7 @@ def controller_batch(
     tunings: Tuning | Sequence[Tuning],
     model: StepResponseModel | Sequence[StepResponseModel],
     *,
-    packed: bool | None = None,
+    summed: bool | None = None,
 ) -> Lanes[ContinuousController]:
     """Continuous controllers of one structure, one per lane, with the matrices of a common model kept once.
 
@@ -103,7 +103,7 @@ def controller_batch(
         tunings: a list of tunings, or one whose arrays have a lane axis (`stack_tunings`). With models per lane a single
             tuning stands for all lanes.
         model: shared by all lanes; or one per lane, as a list or with coefficients ``"lane cv mv n"``.
-        packed: keep the packed products of the dynamic matrix. By default they are kept where it is shared, and left
+        summed: keep the running sums of the dynamic matrix. By default they are kept where it is shared, and left
             out where every lane would need its own.
 
     Returns:
@@ -122,13 +122,13 @@ def controller_batch(
         raise InputError(
             "tunings", f"lane counts {sorted(counts)}", "tunings or models with one lane axis, of one length"
         )
-    packed = (not own_model) if packed is None else packed
+    summed = (not own_model) if summed is None else summed
     each = (stacked if tuned else None, coefficients if own_model else None)
 
     def build(given: tuple[Tuning | None, Any]) -> ContinuousController:
         tuning, own = given
         fitted = eqx.tree_at(lambda m: m.coefficients, one_model, coefficients if own is None else own)
-        return ContinuousController(structure, stacked if tuning is None else tuning, fitted, packed=packed)
+        return ContinuousController(structure, stacked if tuning is None else tuning, fitted, summed=summed)
 
     return build_lanes(build, each, counts.pop())
 

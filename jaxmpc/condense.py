@@ -25,22 +25,24 @@ from jaxmpc.blocking import (
     single_step_blocks,
     window_rows,
 )
+from jaxmpc.gram import SUMMED_LIMIT, running_sums
 from jaxmpc.structure import Structure
 from jaxmpc.tuning import Tuning
 
-PACKED_LIMIT = 64  # variables up to which the packed Gram matrix pays: it needs rows x n(n+1)/2 numbers
+FLAT_ROW = 1e-9  # squared length below which a row has next to no effect, against the longest
+COARSE = 16.0
 
 
 class CondensedQp(eqx.Module):
     """What stays constant from sample to sample; `rows` are the penalised predictions (CV-major) followed by the
     envelope rows of the integer moves, `n` the scaled moves (MV-major).
 
-    `response` and `packed` follow from the structure and the model alone: a batch of tunings shares them, and the Newton
+    `response` and `summed` follow from the structure and the model alone: a batch of tunings shares them, and the Newton
     matrices of all its lanes are one matrix product. What the tuning scales is kept apart in `scale`.
 
     Attributes:
         response: rows of t per MV unit of every move.
-        packed: products response[:, i] * response[:, j] for i <= j, or None where too large.
+        summed: `gram.running_sums` of the prediction rows, or None where too large or too costly.
         hessian: H of the quadratic part without the integer moves' own weight if an envelope is used.
         curvature: H with that weight included (valid at integer moves only).
         move_weight: weight of x^2 that `hessian` holds, 0 where an envelope takes its place.
@@ -49,12 +51,13 @@ class CondensedQp(eqx.Module):
         slack_weight: rho per CV.
         scale: MV units per unit of x.
         row_size: squared length of every row of theta.
+        row_unit: its inverse, for predictions in powers of `COARSE` so that it changes at few samples of the horizon.
         bend: curvature of every move outside all deadzones.
         reach: what one unit of one move can do to a CV at most.
     """
 
     response: Float[Array, "row n"]
-    packed: Float[Array, "row pair"] | None
+    summed: Float[Array, "prediction pair"] | None
     hessian: Float[Array, "n n"]
     curvature: Float[Array, "n n"]
     move_weight: Float[Array, " n"]
@@ -65,6 +68,7 @@ class CondensedQp(eqx.Module):
     slack_weight: Float[Array, " cv"]
     scale: Float[Array, " n"]
     row_size: Float[Array, " row"]
+    row_unit: Float[Array, " row"]
     bend: Float[Array, " n"]
     reach: Float[Array, " cv"]
     has_limits: bool = eqx.field(static=True)
@@ -135,7 +139,7 @@ def condense(
     *,
     envelope: int = 1,
     has_limits: bool = True,
-    packed: bool = True,
+    summed: bool = True,
 ) -> CondensedQp:
     """Build the constant part of the condensed problem (5.8)-(5.13), (6.6).
 
@@ -146,7 +150,8 @@ def condense(
         envelope: largest whole number of steps an integer move can make, for the envelope of its weight; 0 keeps the
             plain square.
         has_limits: whether any CV limit is finite (static; False drops their rows from the solver).
-        packed: whether to keep the packed products of the responses (up to 64 variables).
+        summed: whether to keep the running sums of the responses (up to `SUMMED_LIMIT` variables), which make a Newton
+            step several times as fast; they take longer to make than one step takes.
     """
     blocks, mvs, rows = (
         structure.block_count,
@@ -183,10 +188,11 @@ def condense(
     soft_quadratic = pad(per_cv(tuning.soft_quadratic), jnp.zeros(extra))
     squares = response**2
     largest = jnp.max(jnp.abs(by_cv), axis=1)
-    pay = packed and mvs * blocks <= PACKED_LIMIT
+    row_size = squares @ scale**2
+    pay = summed and mvs * blocks <= SUMMED_LIMIT
     return CondensedQp(
         response=response,
-        packed=packed_products(response) if pay else None,
+        summed=running_sums(raw, structure.cv_count) if pay else None,
         hessian=tracking + jnp.diag(2.0 * weight * own),
         curvature=tracking + jnp.diag(2.0 * weight),
         move_weight=weight * own,
@@ -196,17 +202,20 @@ def condense(
         deadzone=pad(per_cv(tuning.deadzone), jnp.repeat(jnp.asarray(steps, dtype=float), len(integer))),
         slack_weight=tuning.slack_weight,
         scale=scale,
-        row_size=squares @ scale**2,
+        row_size=row_size,
+        row_unit=_row_unit(row_size, rows),
         bend=2.0 * (soft_quadratic @ squares) * scale**2,
         reach=jnp.max(largest * scale, axis=1),
         has_limits=has_limits,
     )
 
 
-def packed_products(response: Float[Array, "row n"]) -> Float[Array, "row pair"]:
-    """Products of the columns i <= j, so that response' diag(w) response is one product w @ packed."""
-    first, second = np.triu_indices(response.shape[-1])
-    return response[:, first] * response[:, second]
+def _row_unit(row_size, predictions: int):
+    """See `CondensedQp`; rows that hardly any move reaches count as longer than they are."""
+    longest = jnp.max(row_size)
+    size = jnp.maximum(row_size, FLAT_ROW * jnp.where(longest > 0.0, longest, 1.0))
+    coarse = COARSE ** jnp.ceil(jnp.log(size[:predictions]) / np.log(COARSE))
+    return 1.0 / jnp.concatenate([coarse, size[predictions:]])
 
 
 def _variable_scale(structure: Structure, tuning: Tuning, curvature) -> Float[Array, " n"]:

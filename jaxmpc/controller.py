@@ -175,14 +175,14 @@ class ContinuousController(eqx.Module):
         structure: static configuration without integer MVs.
         tuning: weights and limits; batch its fields to batch controllers.
         model: step-response model.
-        packed: keep the packed products of the dynamic matrix; pays for batches of 16 or more that share it.
+        summed: keep the running sums of the dynamic matrix; see `condense.condense`.
     """
 
     memory: Memory
     qp: CondensedQp
 
     def __init__(
-        self, structure: Structure, tuning: Tuning, model: StepResponseModel, *, packed: bool = False
+        self, structure: Structure, tuning: Tuning, model: StepResponseModel, *, summed: bool = True
     ):
         if structure.integer_mvs:
             raise InputError(
@@ -195,7 +195,7 @@ class ContinuousController(eqx.Module):
         self.memory = Memory(
             structure, tuning, model.extended(max(structure.prediction_horizon, model.samples))
         )
-        self.qp = condense(structure, tuning, model.coefficients, envelope=0, packed=packed)
+        self.qp = condense(structure, tuning, model.coefficients, envelope=0, summed=summed)
 
     @property
     def structure(self) -> Structure:
@@ -209,7 +209,9 @@ class ContinuousController(eqx.Module):
 
     def init(self, cv: Float[Array, " cv"], mv: Float[Array, " mv"]) -> ControllerState:
         """State at a steady state with measured CVs and present MVs (engineering units)."""
-        return self.memory.init(cv, mv, cold_start(self.qp, len(hard_rows(self.structure))))
+        s = self.structure
+        cold = cold_start(self.qp, len(hard_rows(s)), s.cv_count * s.horizon_count)
+        return self.memory.init(cv, mv, cold)
 
     def step(
         self, state: ControllerState, cv: Float[Array, " cv"], setpoint: Float[Array, " cv"]

@@ -229,7 +229,7 @@ class ScheduledController(ContinuousController):
             self,
             (
                 model.extended(max(s.prediction_horizon, model.samples)),
-                condense(s, self.tuning, model.coefficients, envelope=0, packed=False),
+                condense(s, self.tuning, model.coefficients, envelope=0, summed=False),
             ),
         )
         before = state.mv

@@ -92,7 +92,7 @@ class MixedIntegerControllers:
         narrow = self.solver.relaxer(1)
         if not self.solver.narrow:
             return narrow.lanes, None, None
-        return Lanes(narrow.lanes.each, narrow.shared(self.count)), narrow.hard, narrow.columns
+        return narrow.lanes, narrow.hard, narrow.columns
 
     def scales_of(self, relaxer: Relaxer) -> tuple[Lanes, np.ndarray]:
         """MV units per unit of x as lanes, and the scale of the objective per scenario."""

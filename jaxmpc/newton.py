@@ -1,11 +1,12 @@
-"""A start finished exactly: semismooth Newton on the augmented Lagrangian of the relaxed problem.
+"""A relaxed problem solved exactly: semismooth Newton on its augmented Lagrangian.
 
 With the prices of a neighbouring problem (the previous sample, the parent node) most rows are already known to be inside,
 outside or at the edge of their deadzone, and most limits to be active or not. Every row becomes a proximal
 term with its price (Hermans, Themelis and Patrinos 2022, QPALM), whose gradient is piecewise linear, so that a Newton step
-is exact as soon as the classification is right, which takes a handful of steps even without a start. What is returned is
-judged by its own duality gap; `relaxation` turns to the interior point of `qp` when that is not closed. CV limits that are
-reached are left to the interior point, too.
+is exact as soon as the classification is right. From a start with prices that takes one to three steps. Without
+any, the terms are soft at first and stiffer with every problem solved, which finds the classification in about four.
+What is returned is judged by its own duality gap; `relaxation` turns to the interior point of `qp` when that is not closed.
+CV limits count as hard here: where they cannot be met for their weight, the interior point has to decide what is given up.
 """
 
 from __future__ import annotations
@@ -17,13 +18,34 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxmpc.relaxed_problem import RIDGE, TINY, Prepared, Prices, QpSolution, conclude, solve_positive, total
+from jaxmpc.relaxed_problem import (
+    RIDGE,
+    TINY,
+    Prepared,
+    Prices,
+    QpSolution,
+    Slopes,
+    conclude,
+    solve_positive,
+    total,
+)
 
-STEPS = 20  # Newton steps after which a start is given up
-PENALTY = 1e4  # curvature of a proximal term against the largest of the Hessian
-FLAT_ROW = 1e-9  # squared length below which a row has next to no effect, against the longest
+STEPS = 40  # Newton steps after which a start is given up
+SOFT, STIFF = (
+    10.0,
+    1e4,
+)  # curvature of a proximal term against the largest of the Hessian: without prices, and in the end
+STIFFEN = 10.0  # what it grows by when the problem with the present prices is solved
 SEARCHES = 12  # trials of the line search
 FLAT = 0.3  # share of its slope at the start that the merit may have where a line search ends
+SETTLED, EXACT = (
+    1e-7,
+    1e-12,
+)  # share of the gradient without moves that is left when prices are taken, and at the end
+UNPAID, OUTSIDE = (
+    1e-14,
+    1e-9,
+)  # last change of the prices, squared, and what it leaves hard rows violated by, at the end
 
 
 class WarmStart(eqx.Module):
@@ -32,12 +54,14 @@ class WarmStart(eqx.Module):
     Attributes:
         x: moves.
         row_price: prices of the deadzone rows.
+        limit_price: prices of the CV limits, upper positive.
         box_price: prices of the limits of x, upper positive.
         hard_price: prices of the hard rows, upper positive.
     """
 
     x: Float[Array, " n"]
     row_price: Float[Array, " row"]
+    limit_price: Float[Array, " prediction"]
     box_price: Float[Array, " n"]
     hard_price: Float[Array, " hard"]
 
@@ -47,15 +71,17 @@ def warm_start_of(solution: QpSolution) -> WarmStart:
     return WarmStart(
         x=solution.x,
         row_price=solution.row_price,
+        limit_price=solution.limit_price,
         box_price=solution.upper_price - solution.lower_price,
         hard_price=solution.row_high_price - solution.row_low_price,
     )
 
 
 class _Families(NamedTuple):
-    """One value per deadzone row, limit of x and hard row."""
+    """One value per deadzone row, CV limit, limit of x and hard row."""
 
     row: Array
+    limit: Array
     box: Array
     hard: Array
 
@@ -64,6 +90,7 @@ class _State(NamedTuple):
     x: Array
     t: Array
     prices: _Families
+    stiffness: Array
     ridge: Array
     steps: Array
     done: Array
@@ -77,45 +104,62 @@ class _Proximal(NamedTuple):
     """
 
     problem: Prepared
-    row_sigma: Array
-    hard_sigma: Array
+    sigma: _Families
     knot: Array
     share: Array
 
+    @classmethod
+    def of(cls, problem: Prepared, stiffness) -> _Proximal:
+        """With so much curvature per term."""
+        p = problem
+        row = stiffness * p.qp.row_unit
+        hard = stiffness / jnp.maximum(jnp.sum(p.w_matrix**2, axis=1), TINY)
+        limit = row[: p.limit_high.shape[0]]
+        share = p.curvature / (p.curvature + row)
+        return cls(p, _Families(row, limit, stiffness, hard), row * p.qp.deadzone, share)
+
     def prices(self, x, t, w, old: _Families) -> _Families:
         """New prices at x."""
-        p, excess = self.problem, self._excess(t, old.row)
+        p, sigma = self.problem, self.sigma
+        excess = self._excess(t, old.row)
         return _Families(
             row=self.share * excess + (1.0 - self.share) * jnp.clip(excess, -p.steepness, p.steepness),
-            box=_away(PENALTY * x + old.box, PENALTY * p.lower, PENALTY * p.upper),
-            hard=_away(
-                self.hard_sigma * w + old.hard, self.hard_sigma * p.row_low, self.hard_sigma * p.row_high
-            ),
+            limit=_away(sigma.limit, t[: len(sigma.limit)], old.limit, p.limit_low, p.limit_high),
+            box=_away(sigma.box, x, old.box, p.lower, p.upper),
+            hard=_away(sigma.hard, w, old.hard, p.row_low, p.row_high),
         )
 
-    def slopes(self, t, old: _Families, new: _Families) -> _Families:
+    def slopes(self, t, old: _Families, new: _Families) -> Slopes:
         """Derivatives of the new prices in t, x, w."""
         excess = jnp.abs(self._excess(t, old.row))
-        row = jnp.where(excess <= self.problem.steepness, self.row_sigma, self.row_sigma * self.share)
-        return _Families(
-            row=jnp.where(excess > 0.0, row, 0.0),
-            box=jnp.where(new.box != 0.0, PENALTY, 0.0),
-            hard=jnp.where(new.hard != 0.0, self.hard_sigma, 0.0),
+        level = jnp.where(excess > 0.0, self.sigma.row * self.share, 0.0)
+        at_edge = (excess > 0.0) & (excess <= self.problem.steepness)
+        sharp = jnp.where(at_edge, self.sigma.row * (1.0 - self.share), 0.0)
+        split, bounded = self.problem.predictions, len(self.sigma.limit)
+        limit = jnp.where(new.limit != 0.0, self.sigma.limit, 0.0)
+        return Slopes(
+            level=level[:split],
+            sharp=sharp[:split] + limit if bounded else sharp[:split],
+            envelope=level[split:] + sharp[split:],
+            box=jnp.where(new.box != 0.0, self.sigma.box, 0.0),
+            hard=jnp.where(new.hard != 0.0, self.sigma.hard, 0.0),
         )
 
     def _excess(self, t, price):
-        return _away(self.row_sigma * t + price, -self.knot, self.knot)
+        z = self.sigma.row * t + price
+        return z - jnp.clip(z, -self.knot, self.knot)
 
     def gradient(self, x, prices: _Families):
         """Gradient of the augmented Lagrangian, given the new prices at x."""
         p = self.problem
-        force = p.hessian @ x + p.linear + p.pull(prices.row) + prices.box + prices.hard @ p.w_matrix
-        return p.keep * force
+        force = p.hessian @ x + p.linear + p.pull(p.net(prices.row, prices.limit)) + prices.box
+        return p.keep * (force + prices.hard @ p.w_matrix)
 
 
-def _away(value, low, high):
-    """What a value exceeds its limits by."""
-    return value - jnp.clip(value, low, high)
+def _away(sigma, value, price, low, high):
+    """New price of limits: what sigma value + price exceeds them by."""
+    z = sigma * value + price
+    return z - jnp.clip(z, sigma * low, sigma * high)
 
 
 def refine(
@@ -140,48 +184,39 @@ def refine(
         unless there is nothing left to do here.
     """
     p, keep, unit = problem, problem.keep, problem.unit
-    largest = jnp.max(p.qp.row_size)
-    row_sigma = PENALTY / jnp.maximum(p.qp.row_size, FLAT_ROW * jnp.where(largest > 0.0, largest, 1.0))
-    hard_sigma = PENALTY / jnp.maximum(jnp.sum(p.w_matrix**2, axis=1), TINY)
-    proximal = _Proximal(
-        problem=p,
-        row_sigma=row_sigma,
-        hard_sigma=hard_sigma,
-        knot=row_sigma * p.qp.deadzone,
-        share=p.curvature / (p.curvature + row_sigma),
-    )
     large = 1.0 + jnp.max(jnp.abs(p.linear))
 
     def step(state: _State) -> _State:
+        proximal = _Proximal.of(p, state.stiffness)
         x, t, w = state.x, state.t, state.x @ p.w_matrix.T
         prices = proximal.prices(x, t, w, state.prices)
-        slopes = proximal.slopes(t, state.prices, prices)
         gradient = proximal.gradient(x, prices)
-        matrix = p.newton_matrix(slopes.row, slopes.hard, slopes.box, state.ridge)
+        matrix = p.proximal_matrix(proximal.slopes(t, state.prices, prices), state.ridge)
         dx = -keep * solve_positive(matrix, gradient)
         dt, dw = p.respond(dx), dx @ p.w_matrix.T
         bend, slope = dx @ (p.hessian @ dx), (p.hessian @ x + p.linear) @ dx
 
         def along(alpha):  # derivative of the merit along dx, increasing in alpha
             new = proximal.prices(x + alpha * dx, t + alpha * dt, w + alpha * dw, state.prices)
-            forces = total(new.row * dt) + new.box @ dx + new.hard @ dw
-            return slope + alpha * bend + forces
+            return slope + alpha * bend + total(p.net(new.row, new.limit) * dt) + new.box @ dx + new.hard @ dw
 
         alpha = _search(along, gradient @ dx)
         x, t, w = x + alpha * dx, t + alpha * dt, w + alpha * dw
         prices = proximal.prices(x, t, w, state.prices)
         left = jnp.max(jnp.abs(proximal.gradient(x, prices)))
-        settled, exact = left < 1e-7 * large, left < 1e-12 * large
-        moved = jax.tree.map(lambda new, old: (new - old) ** 2, prices, state.prices)
-        change = total(moved.row / row_sigma) + total(moved.box / PENALTY) + total(moved.hard / hard_sigma)
+        settled, exact = left < SETTLED * large, left < EXACT * large
+        moved = jax.tree.map(lambda new, old: new - old, prices, state.prices)
+        change = sum(jnp.sum(m**2 / sigma) for m, sigma in zip(moved, proximal.sigma, strict=True))
+        outside = jnp.max(jnp.abs(moved.hard) / proximal.sigma.hard, initial=0.0)
         good = jnp.all(jnp.isfinite(x))
         after = _State(
             x=x,
             t=t,
             prices=jax.tree.map(lambda new, old: jnp.where(settled, new, old), prices, state.prices),
+            stiffness=jnp.where(settled, jnp.minimum(STIFFEN * state.stiffness, STIFF), state.stiffness),
             ridge=state.ridge,
             steps=state.steps + 1,
-            done=exact & (change < 1e-14),
+            done=exact & (change < UNPAID) & (outside < OUTSIDE),
         )
         # a matrix that rounding left indefinite is tried again with more on its diagonal
         again = state._replace(ridge=1e2 * state.ridge, steps=state.steps + 1)
@@ -194,23 +229,28 @@ def refine(
         return open_ if axis is None else jax.lax.psum(open_.astype(jnp.int32), axis) > few
 
     x = jnp.where(p.free, jnp.clip(start.x, p.lower, p.upper), 0.5 * (p.lower + p.upper))
+    prices = _Families(
+        row=jnp.where(p.soft, start.row_price / unit, 0.0),
+        limit=start.limit_price[: p.limit_high.shape[0]] / unit,
+        box=keep * start.box_price / unit,
+        hard=jnp.where(p.takes_part, start.hard_price / unit, 0.0),
+    )
+    priced = jnp.any(jnp.concatenate(prices) != 0.0)
     first = _State(
         x=x,
         t=p.respond(x) + p.instance.offset,
-        prices=_Families(
-            row=jnp.where(p.soft, start.row_price / unit, 0.0),
-            box=keep * start.box_price / unit,
-            hard=jnp.where(p.takes_part, start.hard_price / unit, 0.0),
-        ),
+        prices=prices,
+        stiffness=jnp.where(priced, STIFF, SOFT),
         ridge=jnp.asarray(RIDGE),
         steps=jnp.zeros((), dtype=jnp.int32),
         done=jnp.asarray(False) if skip is None else skip,
     )
     state = jax.lax.while_loop(unfinished, step, first)
-    row, box, hard = (unit * value for value in state.prices)
+    row, limit, box, hard = (unit * value for value in state.prices)
     x = jnp.clip(state.x, p.lower, p.upper)
-    solution = conclude(p, x, Prices(row, hard), state.steps)
-    return solution, WarmStart(state.x, row, box, hard), state.done | (state.steps >= STEPS)
+    solution = conclude(p, x, Prices(row, hard, limit), state.steps)
+    resume = WarmStart(state.x, row, solution.limit_price, box, hard)
+    return solution, resume, state.done | (state.steps >= STEPS)
 
 
 def _search(along, slope):

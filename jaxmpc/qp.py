@@ -331,7 +331,6 @@ def solve(
     prices = Prices(
         row=price["above"] - price["below"],
         hard=price["row_high"] - price["row_low"],
-        high=price["high"],
-        low=price["low"],
+        limit=price["high"] - price["low"],
     )
     return conclude(p, x, prices, state.iterations)

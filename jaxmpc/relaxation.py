@@ -1,8 +1,9 @@
 """A relaxed problem, solved to the end: Newton, and where that falls short the interior point and Newton again.
 
 This is what controllers and the integer search call; `qp` and `newton` are its two methods. Under `jax.vmap` a batch is
-not solved in lockstep, where every lane would pay for the slowest: a few lanes at a time take Newton steps
-together, those that finish make room for others, and the interior point sees only the lanes that need it.
+not solved in lockstep, where every lane would pay for the slowest. A CPU solves one lane after the other, so that each takes
+the steps it needs; elsewhere many lanes at a time take Newton steps together, those that finish make room for others, and
+the interior point sees only the lanes that need it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxmpc.condense import PACKED_LIMIT, CondensedQp, QpInstance, packed_products
+from jaxmpc.condense import CondensedQp, QpInstance
+from jaxmpc.gram import SUMMED_LIMIT, running_sums
 from jaxmpc.newton import WarmStart, refine, warm_start_of
 from jaxmpc.qp import solve
 from jaxmpc.relaxed_problem import QpSolution, prepare
@@ -23,9 +25,7 @@ from jaxmpc.status import FAILED, OPTIMAL
 
 ROUGH = 1e-9  # relative gap at which the interior point stops
 ENOUGH = 1e-7  # residual from which on a solution is not improved
-WIDTH = (
-    4  # lanes of a batch that go in lockstep; wider ones wait for their slowest lane longer than they save
-)
+WIDTH = 1024  # lanes of a batch that go in lockstep on an accelerator
 LEFT = 4  # they stop when one in so many is unfinished, and leave the room to others
 AXIS = "relaxed lane"
 
@@ -51,7 +51,7 @@ def solve_relaxed(
         `QpSolution` with status `OPTIMAL` if its duality gap is at most 1e-6 and the hard rows hold to 1e-8 [scaled moves],
         else `FAILED`; `iterations` counts both methods, `residual` is the larger of gap and violation.
     """
-    start = cold_start(qp, len(rows)) if start is None else start
+    start = cold_start(qp, len(rows), instance.limit_high.shape[-1]) if start is None else start
     return _solve((qp, jnp.asarray(rows), instance, lower, upper), start)
 
 
@@ -98,13 +98,15 @@ def _lanes_solver(size: int, own, own_start):
     return solver
 
 
-def _with_products(given, own):
-    """The same problems with packed products where lanes share the responses; and what has a batch axis."""
-    qp, shared = given[0], not own[0].response
-    if qp.packed is not None or not shared or qp.response.shape[-1] > PACKED_LIMIT:
+def _with_sums(given, own):
+    """The same problems with running sums where lanes share the responses; and what has a batch axis."""
+    qp, instance = given[0], given[2]
+    if qp.summed is not None or own[0].response or qp.response.shape[-1] > SUMMED_LIMIT:
         return given, own
-    put = lambda tree, packed: eqx.tree_at(lambda q: q.packed, tree, packed, is_leaf=lambda v: v is None)  # noqa: E731
-    return (put(qp, packed_products(qp.response)), *given[1:]), (put(own[0], False), *own[1:])
+    put = lambda tree, sums: eqx.tree_at(lambda q: q.summed, tree, sums, is_leaf=lambda v: v is None)  # noqa: E731
+    predictions, cvs = instance.limit_high.shape[-1], qp.slack_weight.shape[-1]
+    sums = running_sums(qp.response[:predictions], cvs)
+    return (put(qp, sums), *given[1:]), (put(own[0], False), *own[1:])
 
 
 def _solve_lane(given, start: WarmStart, axis: str | None) -> QpSolution:
@@ -175,10 +177,40 @@ class _Progress(NamedTuple):
 
 def _solve_batch(size: int, given, own, start: WarmStart, own_start) -> QpSolution:
     """Many lanes; `own` and `own_start` are True for arrays with a batch axis."""
+    given, own = _with_sums(given, own)
+    one_by_one = lambda given, start: solve_singly(given, own, start, own_start)  # noqa: E731
+    together = lambda given, start: solve_together(size, given, own, start, own_start)  # noqa: E731
+    return jax.lax.platform_dependent(given, start, cpu=one_by_one, default=together)
+
+
+def solve_singly(given, own, start: WarmStart, own_start) -> QpSolution:
+    """A batch, one lane after the other; arguments as in `solve_together`."""
+    leaves, form = jax.tree.flatten((given, start))
+    mine = jax.tree.leaves((own, own_start))
+
+    def lane(some):
+        some = iter(some)
+        given, start = jax.tree.unflatten(
+            form, [next(some) if its else v for v, its in zip(leaves, mine, strict=True)]
+        )
+        return _solve_lane(given, start, None)
+
+    return jax.lax.map(lane, [v for v, its in zip(leaves, mine, strict=True) if its])
+
+
+def solve_together(size: int, given, own, start: WarmStart, own_start) -> QpSolution:
+    """A batch, up to `WIDTH` lanes in lockstep.
+
+    Args:
+        size: number of lanes.
+        given: arguments of `solve_relaxed` up to the limits.
+        own: of the same structure, True for arrays with a batch axis.
+        start: where to begin.
+        own_start: as `own`.
+    """
     if size <= WIDTH:
         to_the_end = lambda given, start: _solve_lane(given, start, AXIS)  # noqa: E731
         return _lanes(to_the_end, (given, start), (own, own_start))
-    given, own = _with_products(given, own)
     start = jax.tree.map(
         lambda v, mine: v if mine else jnp.broadcast_to(v, (size, *v.shape)), start, own_start
     )
@@ -238,16 +270,20 @@ def _lanes(function, arguments, own):
     return jax.vmap(call, in_axes=axes, axis_name=AXIS)(*leaves)
 
 
-def cold_start(qp: CondensedQp, hard: int) -> WarmStart:
+def cold_start(qp: CondensedQp, hard: int, predictions: int) -> WarmStart:
     """A start that knows nothing: no moves, no prices."""
     rows, n = qp.response.shape
-    return WarmStart(jnp.zeros(n), jnp.zeros(rows), jnp.zeros(n), jnp.zeros(hard))
+    return WarmStart(*(jnp.zeros(size) for size in (n, rows, predictions, n, hard)))
 
 
 def shifted_start(start: WarmStart, cvs: int, horizon: int) -> WarmStart:
     """The same prices one sample later: those of the predictions move one row up, the last is repeated."""
-    predictions = start.row_price[: cvs * horizon].reshape(cvs, horizon)
-    moved = jnp.concatenate([predictions[:, 1:], predictions[:, -1:]], axis=1).reshape(-1)
+
+    def moved(prices):
+        by_cv = prices[: cvs * horizon].reshape(cvs, horizon)
+        later = jnp.concatenate([by_cv[:, 1:], by_cv[:, -1:]], axis=1).reshape(-1)
+        return jnp.concatenate([later, prices[cvs * horizon :]])
+
     return eqx.tree_at(
-        lambda s: s.row_price, start, jnp.concatenate([moved, start.row_price[cvs * horizon :]])
+        lambda s: (s.row_price, s.limit_price), start, (moved(start.row_price), moved(start.limit_price))
     )

@@ -6,6 +6,8 @@ objective is divided by a unit that brings curvatures and prices to the order of
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmpc.condense import CondensedQp, QpInstance
+from jaxmpc.gram import gram
 from jaxmpc.status import FAILED, OPTIMAL
 
 FIXED = 1e-9  # box width [scaled moves] below which a variable is a constant
@@ -53,6 +56,23 @@ class QpSolution(eqx.Module):
     residual: Float[Array, ""]
 
 
+class Slopes(NamedTuple):
+    """Weights of a proximal Newton step.
+
+    Attributes:
+        level, sharp: of the predictions, see `gram`.
+        envelope: of the rows of the envelope.
+        box: of the limits of x.
+        hard: of the hard rows.
+    """
+
+    level: Float[Array, " prediction"]
+    sharp: Float[Array, " prediction"]
+    envelope: Float[Array, " envelope"]
+    box: Float[Array, " n"]
+    hard: Float[Array, " hard"]
+
+
 class Prepared(eqx.Module):
     """One lane, ready to be solved; objective terms are divided by `unit`.
 
@@ -65,6 +85,7 @@ class Prepared(eqx.Module):
         free: moves with room between their limits.
         takes_part: hard rows with free moves; the others are constants.
         row_low, row_high: their limits, infinite for the constants.
+        limit_low, limit_high: CV limits that cost something, infinite for the others; empty where there are none at all.
     """
 
     qp: CondensedQp
@@ -82,6 +103,13 @@ class Prepared(eqx.Module):
     takes_part: Bool[Array, " hard"]
     row_low: Float[Array, " hard"]
     row_high: Float[Array, " hard"]
+    limit_low: Float[Array, " limit"]
+    limit_high: Float[Array, " limit"]
+
+    @property
+    def predictions(self) -> int:
+        """Rows of predictions; those of the envelope follow."""
+        return self.instance.limit_high.shape[0]
 
     @property
     def keep(self) -> Float[Array, " n"]:
@@ -90,7 +118,7 @@ class Prepared(eqx.Module):
 
     def respond(self, x: Float[Array, " n"]) -> Float[Array, " row"]:
         """Theta x."""
-        return (self.qp.scale * x) @ self.qp.response.T  # this order needs no transposed copy of a batch
+        return self.qp.response @ (self.qp.scale * x)
 
     def pull(self, prices: Float[Array, " row"]) -> Float[Array, " n"]:
         """Theta' prices; the rows may be the predictions alone."""
@@ -98,32 +126,31 @@ class Prepared(eqx.Module):
 
     def newton_matrix(self, row, hard, box, ridge) -> Float[Array, "n n"]:
         """Hessian + theta' diag(row) theta + W' diag(hard) W + diag(box) + ridge; identity on fixed moves."""
-        n, keep, scale, w_matrix = self.lower.shape[0], self.keep, self.qp.scale, self.w_matrix
-        own = 1.0 - keep + ridge
-        if self.qp.packed is None:
-            response = self.qp.response * (scale * keep)
-            w_matrix = w_matrix * keep
-            matrix = self.hessian * keep[:, None] * keep[None, :] + jnp.diag(keep * box + own)
-            return matrix + response.T @ (row[:, None] * response) + w_matrix.T @ (hard[:, None] * w_matrix)
-        # the upper triangles in one row each, so that all sums of products are matrix products for the whole batch
-        first, second = np.triu_indices(n)
-        outer = scale[:, None] * scale[None, :]
-        fixed = w_matrix[:, first] * w_matrix[:, second]
-        upper = row @ self.qp.packed + (hard @ fixed) / outer[first, second]
-        matrix = self.hessian + outer * jnp.take(upper, _places(n).reshape(-1)).reshape(n, n)
-        return matrix * keep[:, None] * keep[None, :] + jnp.diag(keep * box + own)
+        response = self.qp.response
+        return self._assembled(response.T @ (row[:, None] * response), hard, box, ridge)
+
+    def net(self, row: Float[Array, " row"], limit: Float[Array, " limit"]) -> Float[Array, " row"]:
+        """Prices of the rows with those of the CV limits, which come first among them, added."""
+        return jnp.concatenate([row[: limit.shape[0]] + limit, row[limit.shape[0] :]]) if len(limit) else row
+
+    def proximal_matrix(self, slopes: Slopes, ridge) -> Float[Array, "n n"]:
+        """`newton_matrix` for the weights of a proximal Newton step."""
+        qp, predictions = self.qp, self.predictions
+        cvs = qp.slack_weight.shape[0]
+        squares = gram(qp.response[:predictions], qp.summed, cvs, slopes.level, slopes.sharp)
+        own = slopes.envelope @ qp.response[predictions:] ** 2  # one move each
+        return self._assembled(squares + jnp.diag(own), slopes.hard, slopes.box, ridge)
+
+    def _assembled(self, squares, hard, box, ridge):
+        """The Newton matrix, given the squares of the rows in MV units."""
+        keep, scale, w_matrix = self.keep, self.qp.scale, self.w_matrix
+        matrix = self.hessian + scale[:, None] * scale[None, :] * squares
+        matrix += w_matrix.T @ (hard[:, None] * w_matrix)
+        return matrix * keep[:, None] * keep[None, :] + jnp.diag(keep * box + (1.0 - keep + ridge))
 
     def value(self, x, t) -> Float[Array, ""]:
         """Objective in its own unit at x with t = theta x + t0."""
         return _value(self.qp, self.instance, x, t)
-
-
-def _places(n: int) -> np.ndarray:
-    """Where entry i, j of a symmetric matrix stands among the packed products."""
-    first, second = np.triu_indices(n)
-    place = np.zeros((n, n), dtype=np.int32)
-    place[first, second] = place[second, first] = np.arange(len(first))
-    return place
 
 
 def prepare(
@@ -153,6 +180,7 @@ def prepare(
     free = (upper - lower) > FIXED
     # rows without free moves are constants and leave the solver; feasibility of the whole is checked outside
     takes_part = (jnp.abs(w_matrix) @ free.astype(lower.dtype)) > 0.0
+    paid = jnp.repeat(qp.slack_weight > 0.0, instance.limit_high.shape[0] // qp.slack_weight.shape[0])
     return Prepared(
         qp=qp,
         w_matrix=w_matrix,
@@ -169,6 +197,8 @@ def prepare(
         takes_part=takes_part,
         row_low=jnp.where(takes_part, instance.row_low, -jnp.inf),
         row_high=jnp.where(takes_part, instance.row_high, jnp.inf),
+        limit_low=jnp.where(paid, instance.limit_low, -jnp.inf) if qp.has_limits else jnp.zeros(0),
+        limit_high=jnp.where(paid, instance.limit_high, jnp.inf) if qp.has_limits else jnp.zeros(0),
     )
 
 
@@ -221,12 +251,11 @@ def limit_cost(qp: CondensedQp, instance: QpInstance, t):
 
 
 class Prices(eqx.Module):
-    """Multipliers in the objective's own unit: net of both sides, but for the CV limits, None where all are zero."""
+    """Multipliers in the objective's own unit, net of both sides; `limit` may be empty or None where all are zero."""
 
     row: Float[Array, " row"]
     hard: Float[Array, " hard"]
-    high: Float[Array, " prediction"] | None = None
-    low: Float[Array, " prediction"] | None = None
+    limit: Float[Array, " limit"] | None = None
 
 
 def conclude(
@@ -258,11 +287,10 @@ def conclude(
     net, limit_price = price, jnp.zeros_like(instance.limit_high)
     if qp.has_limits:
         found += jnp.sum(limit_cost(qp, instance, t))
-    if qp.has_limits and prices.high is not None and prices.low is not None:
-        high, low, paid = _limit_terms(qp, instance, t, prices.high, prices.low)
+    if qp.has_limits and prices.limit is not None:
+        limit_price, paid = _limit_terms(qp, instance, t, prices.limit)
         found -= paid
-        limit_price = high - low
-        net = jnp.concatenate([price[: limit_price.shape[0]] + limit_price, price[limit_price.shape[0] :]])
+        net = problem.net(price, limit_price)
     wx = x @ problem.w_matrix.T
     row_low, row_high = jnp.maximum(-prices.hard, 0.0), jnp.maximum(prices.hard, 0.0)
     found -= jnp.sum(jnp.where(row_high > 0, row_high * (wx - instance.row_high), 0.0))
@@ -296,15 +324,15 @@ def conclude(
     )
 
 
-def _limit_terms(qp: CondensedQp, instance: QpInstance, t, high, low):
+def _limit_terms(qp: CondensedQp, instance: QpInstance, t, price):
     """Prices of the CV limits that spend no more than rho per CV and side, and what they add to the bound."""
     cvs, predictions = qp.slack_weight.shape[0], instance.limit_high.shape[0]
     rho = jnp.concatenate([qp.slack_weight, qp.slack_weight])
-    both = jnp.concatenate([high, low]).reshape(2 * cvs, -1)
+    both = jnp.maximum(jnp.concatenate([price, -price]), 0.0).reshape(2 * cvs, -1)
     spent = jnp.sum(both, axis=1)
     both = both * jnp.where(spent > rho, rho / jnp.maximum(spent, TINY), 1.0)[:, None]
     high, low = both.reshape(-1)[:predictions], both.reshape(-1)[predictions:]
     y = t[:predictions]
     paid = total(jnp.where(high > 0, high * (y - instance.limit_high), 0.0))
     paid += total(jnp.where(low > 0, low * (instance.limit_low - y), 0.0))
-    return high, low, paid
+    return high - low, paid

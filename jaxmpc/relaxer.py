@@ -29,7 +29,6 @@ from jaxmpc.structure import Structure
 
 SIZES = (1, 8, 64)  # lanes of a call, one compiled program each; a batch is padded to the least that holds it
 SINGLY = 3  # problems up to which calls of one lane are faster than a padded batch
-LEAN = 4  # lanes up to which the packed products are not worth streaming through the cache
 WIDE = 128  # variables from which problems are solved one by one
 ROW_ROUNDING = 1e-6  # slack of the hard rows of rounded moves, which are whole numbers themselves
 
@@ -42,7 +41,8 @@ class Constants:
     def __init__(self, structure: Structure, qp: CondensedQp):
         self.structure, self.qp = structure, qp
         self.rows = hard_rows(structure)
-        self.cold = jax.tree.map(np.asarray, cold_start(qp, len(self.rows)))
+        predictions = structure.cv_count * structure.horizon_count
+        self.cold = jax.tree.map(np.asarray, cold_start(qp, len(self.rows), predictions))
         self.integer = integer_columns(structure)
         self.scales = np.asarray(qp.scale)  # MV units per unit of x
         hessian = np.asarray(qp.hessian)
@@ -50,7 +50,6 @@ class Constants:
         self.root_factor = root_factor(self.schur)
         self.order = assignment_order(structure.block_count, len(structure.integer_mvs))
         self.leading = leading_factor(self.schur[np.ix_(self.order, self.order)])
-        predictions = structure.cv_count * structure.horizon_count
         self.slope = np.asarray(qp.soft_linear)[predictions:]  # of the envelope rows
         self.knot = np.asarray(qp.deadzone)[predictions:]
         self.levels = len(self.slope) // max(len(self.integer), 1)
@@ -162,9 +161,6 @@ class Relaxer:
         first = constants[0]
         self.structure, self.rows, self.integer = first.structure, first.rows, first.integer
         self.lanes = lanes_of([c.qp for c in constants])
-        self.lean = eqx.tree_at(
-            lambda q: q.packed, self.lanes.shared, None, is_leaf=lambda leaf: leaf is None
-        )
         self.hard, self.columns = jnp.asarray(self.rows), jnp.asarray(self.integer)
         self.one = len(constants) == 1
         self.compiling = 0.0  # seconds of first calls so far
@@ -172,7 +168,8 @@ class Relaxer:
         self.sizes = SIZES if n <= WIDE else SIZES[:1]
         self.predictions = rows - len(first.knot)
         numbers: Any = lambda *shape: jax.ShapeDtypeStruct((1, *shape), jnp.float64)  # noqa: E731
-        start = WarmStart(numbers(n), numbers(rows), numbers(n), numbers(len(self.rows)))
+        sizes = n, rows, self.predictions, n, len(self.rows)
+        start = WarmStart(*(numbers(size) for size in sizes))
         self.of_lanes = Packing.of((numbers(n), numbers(n), start))
         self.solved_shapes = Solved(
             start, numbers(), numbers(), numbers(), jax.ShapeDtypeStruct((1,), jnp.int32)
@@ -229,10 +226,6 @@ class Relaxer:
             return 1
         return next((s for s in self.sizes if s >= count), self.sizes[-1])
 
-    def shared(self, lanes: int) -> CondensedQp:
-        """What all scenarios share, with the packed products only where so many lanes are worth them."""
-        return self.lean if lanes <= LEAN else self.lanes.shared
-
     def fitting(self, warm: WarmStart | None, count: int) -> WarmStart:
         """The starts if they have as many rows as the problems (wider integer ranges have more), else cold ones."""
         cold = self.scenario(0).cold
@@ -248,9 +241,8 @@ class Relaxer:
 
     def _call(self, problems, index, lanes, of_instances: Packing) -> np.ndarray:
         """Call the relaxation; a first call compiles, which is not held against a time limit."""
-        shared = self.shared(len(index))
         packings = of_instances, self.of_lanes, self.of_solved
-        arguments = (shared, self.lanes.each, self.hard, self.columns, problems, index, lanes)
+        arguments = (self.lanes.shared, self.lanes.each, self.hard, self.columns, problems, index, lanes)
         form = problems.shape, lanes.shape, packings, jax.tree.structure(arguments)
         if form not in _COMPILED:
             begin = time.perf_counter()

@@ -59,15 +59,15 @@ def test_tunings_share_the_matrices_of_the_model(structure, tunings, well_like_m
     lanes = controller_batch(structure, tunings, well_like_model)
     assert lanes.count == 3
     assert lanes.each.memory.coefficients is None
-    assert lanes.each.qp.packed is None
-    assert lanes.shared.qp.packed is not None
+    assert lanes.each.qp.summed is None
+    assert lanes.shared.qp.summed is not None
     theirs = {leaf.shape[0] for leaf in jax.tree.leaves(lanes.each)}
     assert theirs == {3}
     rows = structure.cv_count * structure.horizon_count
     # nothing with rows times moves numbers has a lane axis
     assert max(leaf[0].size for leaf in jax.tree.leaves(lanes.each)) < rows * 12
     for k, tuning in enumerate(tunings):
-        assert_same(lanes.lane(k), ContinuousController(structure, tuning, well_like_model, packed=True))
+        assert_same(lanes.lane(k), ContinuousController(structure, tuning, well_like_model, summed=True))
 
 
 def test_stacked_tunings_are_a_list_of_tunings(structure, tunings, well_like_model):
@@ -78,14 +78,14 @@ def test_stacked_tunings_are_a_list_of_tunings(structure, tunings, well_like_mod
 def test_models_may_have_lanes(structure, tunings, models):
     lanes = controller_batch(structure, tunings, models)
     assert lanes.shared.memory.coefficients is None
-    assert lanes.value.qp.packed is None
+    assert lanes.value.qp.summed is None
     for k in range(3):
-        assert_same(lanes.lane(k), ContinuousController(structure, tunings[k], models[k]))
+        assert_same(lanes.lane(k), ContinuousController(structure, tunings[k], models[k], summed=False))
     stacked = eqx.tree_at(lambda m: m.coefficients, models[0], jnp.stack([m.coefficients for m in models]))
     assert_same(lanes, controller_batch(structure, tunings, stacked))
     one_tuning = controller_batch(structure, tunings[1], models)
     assert one_tuning.each.tuning.cv_weight is None
-    assert_same(one_tuning.lane(2), ContinuousController(structure, tunings[1], models[2]))
+    assert_same(one_tuning.lane(2), ContinuousController(structure, tunings[1], models[2], summed=False))
 
 
 def test_value_and_axes_are_what_vmap_takes(structure, tunings, well_like_model):

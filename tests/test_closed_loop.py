@@ -98,7 +98,7 @@ def lanes(model):
     tunings = [
         presets.tuning(structure, changes={"move_weight": {"choke": w, "gas_lift": 0.2}}) for w in WEIGHTS
     ]
-    return controller_batch(structure, tunings, model, packed=False)
+    return controller_batch(structure, tunings, model, summed=False)
 
 
 def whole(batches):
@@ -229,7 +229,7 @@ from studies import presets
 assert jax.device_count() == 4
 structure = presets.structure()
 tunings = [presets.tuning(structure, changes={"move_weight": {"choke": w, "gas_lift": 0.2}}) for w in WEIGHTS]
-lanes = controller_batch(structure, tunings, StepResponseModel.load(sys.argv[1]), packed=False)
+lanes = controller_batch(structure, tunings, StepResponseModel.load(sys.argv[1]), summed=False)
 reference = Reference([0.0, 200.0], [[11013.0, 185.0], [12600.0, 175.0]], 1200.0)
 (batch,) = simulate_batches(lanes, WellPlant(), reference, samples=25, noise=[40.0, 0.5])
 np.savez(sys.argv[2], **batch.fields)

@@ -249,13 +249,13 @@ def test_tunings_share_the_response_of_their_model():
             tuning, cv_weight=weight * tuning.cv_weight, move_high=limit * tuning.move_high
         )
         qp = condense(s, tuning, coefficients)
-        return (qp.response, qp.packed), qp.scale, qp.theta
+        return (qp.response, qp.summed), qp.scale, qp.theta
 
     # `out_axes=None` is refused for anything that has a batch axis
     over = jax.vmap(constants, in_axes=(0, 0), out_axes=(None, 0, 0))
-    (response, packed), scale, theta = over(jnp.asarray([1.0, 3.0]), jnp.asarray([1.0, 2.0]))
+    (response, summed), scale, theta = over(jnp.asarray([1.0, 3.0]), jnp.asarray([1.0, 2.0]))
     assert response.shape == (30 + 5, 10)
-    assert np.shape(packed) == (30 + 5, 55)
+    assert np.shape(summed) == (30, 55)
     assert not np.allclose(scale[0], scale[1])
     np.testing.assert_allclose(theta[1], response * scale[1], rtol=1e-15)
     np.testing.assert_array_equal(theta[1][30:, :5], np.eye(5))

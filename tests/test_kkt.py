@@ -67,7 +67,7 @@ def relaxed(body: dict):
         case.tuning,
         case.model.coefficients,
         envelope=int(bool(structure.integer_mvs)),
-        packed=False,
+        summed=False,
     )
     instance = make_instance(
         structure,

@@ -10,7 +10,7 @@ from jaxmpc.packing import Packing
 
 def tree():
     rng = np.random.default_rng(0)
-    start = WarmStart(*(rng.normal(size=(3, n)) for n in (4, 7, 4, 2)))
+    start = WarmStart(*(rng.normal(size=(3, n)) for n in (4, 7, 6, 4, 2)))
     return start, {"status": np.array([0, 3, 1], dtype=np.int32), "good": np.array([True, False, True])}
 
 

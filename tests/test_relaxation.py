@@ -11,7 +11,7 @@ from jaxmpc.blocking import hard_rows
 from jaxmpc.condense import condense, make_instance
 from jaxmpc.newton import WarmStart, refine, warm_start_of
 from jaxmpc.qp import solve
-from jaxmpc.relaxation import cold_start, solve_relaxed
+from jaxmpc.relaxation import cold_start, solve_relaxed, solve_together
 from jaxmpc.relaxed_problem import evaluate, prepare
 from jaxmpc.tuning import make_tuning
 
@@ -91,6 +91,7 @@ def test_the_interior_point_alone_and_newton_from_nonsense_agree(batch, solved):
     start = WarmStart(
         jnp.asarray(rng.normal(size=(LANES, n)) * 10),
         jnp.asarray(rng.normal(size=(LANES, m)) * 100),
+        jnp.asarray(rng.normal(size=instances.limit_high.shape) * 100),
         jnp.asarray(rng.normal(size=(LANES, n)) * 1e4),
         jnp.asarray(rng.normal(size=(LANES, len(rows))) * 1e4),
     )
@@ -118,7 +119,7 @@ def test_a_batch_equals_its_lanes_and_its_permutation(batch, solved):
     run = jax.jit(jax.vmap(lambda i: solve_relaxed(qp, rows, i, i.lower, i.upper)))
     shuffled = run(jax.tree.map(lambda v: v[order], instances))
     np.testing.assert_allclose(shuffled.objective, solved.objective[order], rtol=1e-12)
-    lean = eqx.tree_at(lambda q: q.packed, qp, None)
+    lean = eqx.tree_at(lambda q: q.summed, qp, None)
     one = jax.jit(lambda i: solve_relaxed(lean, rows, i, i.lower, i.upper))
     for lane in range(3):
         alone = one(jax.tree.map(lambda v, k=lane: v[k], instances))
@@ -133,7 +134,7 @@ def test_crossed_limits_are_never_success(batch):
     assert int(got.status) == status.FAILED
 
 
-MIXED = 40  # more lanes than go in lockstep
+MIXED = 40
 NOT_A_NUMBER, CROSSED, CONFLICT, FIXED_MOVES = 3, 7, 11, 15  # lanes of `mixed` that are no ordinary problems
 
 
@@ -177,6 +178,21 @@ def test_a_lane_of_a_large_batch_does_not_depend_on_its_neighbours(mixed, mixed_
     )
 
 
+@pytest.mark.parametrize("width", [4, MIXED])
+def test_lanes_in_lockstep_find_what_single_lanes_find(width, mixed, mixed_solved, monkeypatch):
+    """What an accelerator runs: all at once, or a few at a time that make room for others."""
+    _, qp, rows, lanes = mixed
+    monkeypatch.setattr("jaxmpc.relaxation.WIDTH", width)
+    given = qp, jnp.asarray(rows), lanes, lanes.lower, lanes.upper
+    all_of = lambda tree, flag: jax.tree.map(lambda _: flag, tree)  # noqa: E731
+    own = *all_of(given[:2], False), *all_of(given[2:], True)
+    cold = cold_start(qp, len(rows), lanes.limit_high.shape[-1])
+    together = jax.jit(lambda given: solve_together(MIXED, given, own, cold, all_of(cold, False)))(given)
+    assert np.array_equal(together.status, mixed_solved.status)
+    solved = np.asarray(together.status) == status.OPTIMAL
+    np.testing.assert_allclose(together.objective[solved], mixed_solved.objective[solved], rtol=1e-6)
+
+
 def test_a_batch_of_batches_is_one_batch(mixed, mixed_solved):
     _, qp, rows, lanes = mixed
     fold = lambda tree: jax.tree.map(lambda v: v.reshape(2, MIXED // 2, *v.shape[1:]), tree)  # noqa: E731
@@ -208,7 +224,7 @@ def test_lanes_with_models_of_their_own_are_each_solved_with_its_model(batch, th
     few = jax.tree.map(lambda v: v[:2], instances)
 
     def value(gain, instance):
-        qp = condense(structure, tuning, gain * well_like_model.coefficients, envelope=0, packed=False)
+        qp = condense(structure, tuning, gain * well_like_model.coefficients, envelope=0, summed=False)
         solution = solve_relaxed(qp, rows, instance, instance.lower, instance.upper)
         return solution.objective, solution.status
 
@@ -231,7 +247,7 @@ def test_a_warm_batch_inside_a_scan_takes_few_steps(batch):
         solution = jax.vmap(run)(eqx.tree_at(lambda i: i.offset, lanes, share * lanes.offset), start)
         return warm_start_of(solution), (solution.status, solution.iterations)
 
-    cold = cold_start(qp, len(rows))
+    cold = cold_start(qp, len(rows), instances.limit_high.shape[-1])
     start = jax.tree.map(lambda v: jnp.tile(v, (2 * LANES, 1)), cold)
     _, (codes, steps) = jax.jit(lambda s: jax.lax.scan(sample, s, jnp.asarray([1.0, 1.0, 1.001])))(start)
     assert (np.asarray(codes) == status.OPTIMAL).all()

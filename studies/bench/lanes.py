@@ -43,10 +43,11 @@ class Lanes:
         make = functools.partial(
             condense, self.structure, self.tuning, instances.model.coefficients, envelope=0
         )
-        self.qp, self.packed = make(packed=False), make(packed=True)
+        self.qp = make()
         self.rows = hard_rows(self.structure)
         self.instances = self._build(instances.now)
-        self.cold: Any = self._repeat(cold_start(self.qp, len(self.rows)), len(instances))
+        predictions = self.structure.cv_count * self.structure.horizon_count
+        self.cold: Any = self._repeat(cold_start(self.qp, len(self.rows), predictions), len(instances))
         self._before = instances.before
 
     def _build(self, problems: Problems):
@@ -103,7 +104,7 @@ class Lanes:
 
     def solve_batch(self, batch: tuple[Any, Any]) -> QpSolution:
         """Solve a batch in one call; blocks until it is done."""
-        return jax.block_until_ready(_solve_many(self.rows, self.packed, *batch))
+        return jax.block_until_ready(_solve_many(self.rows, self.qp, *batch))
 
     def plans(self, x) -> list[np.ndarray]:
         """Plans ``"block mv"`` [MV unit] of solutions ``"lane n"``."""
