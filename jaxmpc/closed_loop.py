@@ -12,11 +12,11 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.batch import Lanes, for_all, map_lanes, per_lane, place, variant_mesh
-from jaxmpc.controller import ContinuousController, ControllerState, StepInfo
+from jaxmpc.batch import Lanes, for_all, place, variant_mesh
+from jaxmpc.compiled_loop import CHUNK, even, record_of, run_piece, scan, start
+from jaxmpc.controller import ContinuousController, ControllerState
 from jaxmpc.errors import InputError
 from jaxmpc.host_well import HostWell
 from jaxmpc.interventions import CarriedOut, checked_changes, checked_sample, handed_over
@@ -27,10 +27,9 @@ from jaxmpc.reference import Reference
 from jaxmpc.strides import able, simulate_in_strides
 from jaxmpc.structure import Structure
 from jaxmpc.sweep import Sweep, check_match, check_offsets, sampled
-from jaxmpc.together import advance_together
+from jaxmpc.together import advance_together, errors_of
 from jaxmpc.trajectory import RECORDABLE, Trajectory, TrajectoryBatch
 
-CHUNK = 300  # samples between two progress reports of a compiled loop
 LANES = 256  # of a sweep that run side by side
 Progress = Callable[[int, int], None]
 
@@ -91,7 +90,7 @@ def simulate(
     if plain and isinstance(controller, ContinuousController):
         record = _simulate_compiled(controller, plant, inputs, progress, keep_plans)
     elif plain and isinstance(controller, MixedIntegerController) and able(controller.together):
-        record = simulate_in_strides(controller.together, plant, inputs, progress)
+        record = _simulate_in_strides(controller.together, plant, inputs, progress)
     else:
         record = _simulate_on_host(controller, plant, inputs, progress, takeovers, blind)
     if not keep_plans:
@@ -114,56 +113,15 @@ def _labels(structure: Structure, samples: int) -> dict[str, Any]:
     )
 
 
-def _record(cv, mv, state: ControllerState, info: StepInfo) -> dict[str, Any]:
-    """What a sample leaves behind, by the names of `Trajectory`; a compiled loop has no solve time yet."""
-    return dict(
-        cv=cv,
-        mv_demand=info.mv,
-        mv=mv,
-        move=info.move,
-        plan=info.moves,
-        bias=state.bias,
-        bias_raw=state.bias_raw,
-        status=info.status,
-        fallback=info.fallback,
-        objective=info.objective,
-        bound=info.bound,
-        gap=info.gap,
-        nodes=info.nodes,
-        finished_by=info.finished_by,
-    )
-
-
 # ------------------------------------------------------------------------------------------------ compiled
 
 
-def _start(controller: ContinuousController, plant: WellPlant):
-    plant_state = plant.init()
-    outputs = plant.measure(plant_state)
-    return controller.init(outputs.cv, outputs.mv), plant_state, outputs.cv
-
-
-def _scan(controller: ContinuousController, plant: WellPlant, carry, inputs, recorded=RECORDABLE):
-    """Some samples of a compiled loop: measure, decide, advance the plant."""
-
-    def one(carry, inputs):
-        state, plant_state, cv = carry
-        setpoint, offset, error = inputs
-        measured = cv + error
-        state, info = controller.step(state, measured, setpoint)
-        plant_state, outputs = plant.step(plant_state, state.mv, offset)
-        record = _record(measured, outputs.mv, state, info)
-        return (state, plant_state, outputs.cv), {k: v for k, v in record.items() if k in recorded}
-
-    return jax.lax.scan(one, carry, inputs)
-
-
-_run_chunk: Any = eqx.filter_jit(_scan)
+_run_chunk: Any = eqx.filter_jit(scan)
 
 
 def _simulate_compiled(controller, plant, inputs, progress: Progress | None, keep_plans: bool):
     recorded = (*RECORDABLE, "plan") if keep_plans else RECORDABLE
-    carry = _start(controller, plant)
+    carry = start(controller, plant)
     total, parts = len(inputs[0]), []
     ready: set[int] = set()
     for begin in range(0, total, CHUNK):
@@ -180,6 +138,21 @@ def _simulate_compiled(controller, plant, inputs, progress: Progress | None, kee
         if progress is not None:
             progress(begin + count, total)
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+def _simulate_in_strides(controllers: MixedIntegerControllers, plant, inputs, progress: Progress | None):
+    """A single mixed-integer controller."""
+    done, total = 0, len(inputs[0])
+
+    def tick(samples: int):
+        nonlocal done
+        done += samples
+        if progress is not None and done:
+            progress(done, total)
+
+    setpoints, offsets, errors = (v[None] for v in inputs)
+    fields = simulate_in_strides(controllers, for_all(plant), (setpoints, offsets, errors), tick)
+    return {name: values[0] for name, values in fields.items()}
 
 
 # ------------------------------------------------------------------------------------------------- on the host
@@ -230,7 +203,7 @@ class _Compiled:
     def step(self, state, cv, setpoint):
         begin = time.perf_counter()
         state, info = jax.block_until_ready(_jitted_step(self.controller, state, cv, setpoint))
-        record = _record(cv, info.mv, state, info) | {"solve_time": time.perf_counter() - begin}
+        record = record_of(cv, info.mv, state, info) | {"solve_time": time.perf_counter() - begin}
         return state, {name: np.asarray(value) for name, value in record.items()}
 
 
@@ -245,7 +218,7 @@ class _BatchOfOne:
 
     def step(self, state, cv, setpoint):
         state, info = self.controllers.step(state, cv[None], setpoint[None])
-        record = _record(cv[None], info.mv, state, info) | {"solve_time": info.solve_time}
+        record = record_of(cv[None], info.mv, state, info) | {"solve_time": info.solve_time}
         return state, {name: value[0] for name, value in record.items()}
 
 
@@ -310,13 +283,6 @@ def simulate_batches(
     return _pieces(sweep, tuple(record), lanes_at_once, variant_mesh(devices), progress)
 
 
-def _even(total: int, most: int, multiple: int = 1) -> int:
-    """Size of equal pieces of at most `most` (or `multiple`), a multiple of `multiple`, that cover `total`."""
-    most = max(most // multiple, 1)
-    units = -(-total // multiple)
-    return multiple * -(-units // -(-units // most))
-
-
 def _pieces(sweep: Sweep, record, lanes_at_once: int, mesh, progress) -> Iterator[TrajectoryBatch]:
     done = 0
 
@@ -331,8 +297,19 @@ def _pieces(sweep: Sweep, record, lanes_at_once: int, mesh, progress) -> Iterato
         inputs = sweep.setpoints_of(everyone), sweep.offsets_of(everyone)
         noise = sweep.deviation, sweep.seeds
 
+        if able(sweep.controllers):
+            errors = errors_of(sweep.deviation, sweep.seeds, np.arange(sweep.samples))
+            together = simulate_in_strides(sweep.controllers, sweep.plants, (*inputs, errors), tick)
+            yield TrajectoryBatch(
+                lanes=everyone,
+                setpoint=inputs[0],
+                fields={name: together[name] for name in record},
+                **_labels(sweep.structure, sweep.samples),
+            )
+            return
+
         def keep(cv, mv, state, info):
-            fields = _record(cv, mv, state, info) | {"solve_time": info.solve_time}
+            fields = record_of(cv, mv, state, info) | {"solve_time": info.solve_time}
             return {name: value for name, value in fields.items() if name in record}
 
         yield TrajectoryBatch(
@@ -342,7 +319,7 @@ def _pieces(sweep: Sweep, record, lanes_at_once: int, mesh, progress) -> Iterato
             **_labels(sweep.structure, sweep.samples),
         )
         return
-    size = _even(sweep.count, lanes_at_once, mesh.size)
+    size = even(sweep.count, lanes_at_once, mesh.size)
     whole = sweep.controllers, sweep.plants
     common = [place(for_all(lanes.shared), mesh).shared for lanes in whole]
     for begin in range(0, sweep.count, size):
@@ -352,48 +329,6 @@ def _pieces(sweep: Sweep, record, lanes_at_once: int, mesh, progress) -> Iterato
         yield TrajectoryBatch(  # no name keeps it: it is gone when the caller lets go
             lanes=index[:real],
             setpoint=sweep.setpoints_of(index[:real]),
-            fields=_run_piece(sweep, whole, common, index, real, record, mesh, tick),
+            fields=run_piece(sweep, whole, common, index, real, record, mesh, tick),
             **_labels(sweep.structure, sweep.samples),
         )
-
-
-def _run_piece(sweep: Sweep, whole, common, index, real: int, record, mesh, tick) -> dict[str, np.ndarray]:
-    """Recorded fields "lane sample ..." of the first `real` of some lanes."""
-    put = lambda lanes: place(lanes, mesh)  # noqa: E731
-    own = [lanes.take(index).each for lanes in whole]
-    loop = [put(Lanes(each, shared)) for each, shared in zip(own, common, strict=True)]
-    seeds, deviation = put(per_lane(sweep.seeds[index])), put(per_lane(sweep.deviation[index]))
-    carry = map_lanes(_start, loop, mesh)
-    setpoints, offsets = sweep.setpoints_of(index), sweep.offsets_of(index)
-    length = _even(sweep.samples, CHUNK)
-    fields: dict[str, np.ndarray] = {}
-    for begin in range(0, sweep.samples, length):
-        # samples beyond the end are simulated and dropped, for the sake of one shape
-        now = np.minimum(np.arange(begin, begin + length), sweep.samples - 1)
-        count = min(length, sweep.samples - begin)
-        inputs = put(per_lane((setpoints[:, now], offsets[:, now])))
-        which = put(for_all(jnp.asarray(begin)))
-        arguments = [*loop, per_lane(carry), inputs, seeds, deviation, which, for_all(record)]
-        if index[0] == 0 and begin == 0:  # compile before the clock starts
-            map_lanes.lower(_window, arguments, mesh).compile()
-            tick(0)
-        started = time.perf_counter()
-        carry, part = jax.block_until_ready(map_lanes(_window, arguments, mesh))
-        # as in one compiled loop: every sample gets the mean of its chunk, and lanes share the time equally
-        mean = (time.perf_counter() - started) / (length * len(index))
-        part = {name: np.asarray(value) for name, value in part.items()}
-        if "solve_time" in record:
-            part["solve_time"] = np.full((len(index), length), mean)
-        for name, value in part.items():
-            if name not in fields:
-                fields[name] = np.empty((real, sweep.samples, *value.shape[2:]), dtype=value.dtype)
-            fields[name][:, begin : begin + count] = value[:real, :count]
-        tick(real * count)
-    return fields
-
-
-def _window(controller, plant, carry, inputs, seed, deviation, begin, record):
-    """Some samples of one lane, the first of them number `begin`."""
-    setpoints, offsets = inputs
-    errors = noise_samples(deviation, seed[0], seed[1], begin + jnp.arange(len(setpoints)))
-    return _scan(controller, plant, carry, (setpoints, offsets, errors), record)

@@ -14,7 +14,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxmpc.relaxer import Constants, Relaxations
+from jaxmpc.constants import Constants
+from jaxmpc.relaxer import Relaxations
 
 
 def cut_of(constants: Constants, result: Relaxations, lane: int, lower, upper):

@@ -19,20 +19,22 @@ import numpy as np
 from jaxmpc.blocking import first_position_rows, moves_per_block
 from jaxmpc.branch_and_bound import branch_and_bound
 from jaxmpc.condense import QpInstance
+from jaxmpc.constants import Constants
 from jaxmpc.cuts import Cuts
 from jaxmpc.enumeration import enumerate_all
 from jaxmpc.levelset import LowerModel, enumerate_below, exclude
 from jaxmpc.newton import WarmStart
 from jaxmpc.outer_approximation import outer_approximation
 from jaxmpc.propagation import propagate, satisfied
-from jaxmpc.relaxer import Constants, Relaxations, Relaxer
+from jaxmpc.relaxer import Relaxations, Relaxer
 from jaxmpc.scheduling import run
 from jaxmpc.search import GROUP, Search, SearchResult, Steps
-from jaxmpc.status import INFEASIBLE, OPTIMAL
+from jaxmpc.status import FINISHERS, INFEASIBLE, OPTIMAL
 from jaxmpc.structure import Structure
 
 BEAM = 64  # partial candidates kept while looking for good first moves
 HIGHS_SECONDS = 0.1  # what the reduced MILP may take before branch and bound closes the rest
+UNINTERRUPTED = 0.05  # time limits from which on a search may run as one compiled call [s]
 FINISHES = ("auto", "enumeration", "highs", "branch-and-bound")
 
 
@@ -82,6 +84,8 @@ def solve_integers(
     gap: float = 1e-6,
     time_limit: float | None = None,
     finish: str = "auto",
+    which: Sequence[int] | np.ndarray | None = None,
+    searched: bool = False,
 ) -> tuple[list[SearchResult], Relaxations]:
     """Solve the problems of many scenarios side by side; arguments as in `solve_integer`, with a scenario axis.
 
@@ -94,9 +98,11 @@ def solve_integers(
         gap: relative gap.
         time_limit: seconds of work per scenario.
         finish: path that has to close the problems.
+        which: scenarios to solve; all if not given.
+        searched: whether the compiled search has been tried.
 
     Returns:
-        ``(results, roots)``: one result per scenario, and the solved relaxations of all.
+        ``(results, roots)``: one result per scenario that was to be solved, and the solved relaxations of all.
     """
     count = len(instances.lower)
     begin, compiled = time.perf_counter(), relaxer.compiling
@@ -104,13 +110,23 @@ def solve_integers(
         root = relaxer.solve_roots(instances, relaxer.fitting(warm, count))
     seconds = time.perf_counter() - begin - (relaxer.compiling - compiled)
     results: list[SearchResult | None] = [None] * count
-    open_searches = []
-    for i in range(count):
+    waiting, open_searches = [], []
+    for i in range(count) if which is None else which:
         bound, value = max(float(root.bound[i]), 0.0), float(root.snapped[i])
         scale = max(abs(value), 1e-6 * relaxer.scenario(i).scale)
         if finish == "auto" and np.isfinite(value) and value - bound <= max(gap, 1e-9) * scale:
             results[i] = _closed_by_root(relaxer, root, i, bound, seconds / count)
             continue
+        waiting.append(i)
+    quick = (
+        finish == "auto"
+        and not searched
+        and (time_limit is None or time_limit >= UNINTERRUPTED)
+        and relaxer.tables is not None
+    )
+    if waiting and quick:
+        _decided_at_once(relaxer, instances, np.asarray(waiting), root, gap, seconds / count, results)
+    for i in [i for i in waiting if results[i] is None]:
         own = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], instances)
         search = Search(relaxer.scenario(i), own, root.part(i, i + 1), gap, time_limit)
         search.spent = seconds / count
@@ -121,6 +137,34 @@ def solve_integers(
             result.seconds = search.spent
             results[i] = result
     return [result for result in results if result is not None], root
+
+
+def _decided_at_once(
+    relaxer: Relaxer,
+    instances: QpInstance,
+    index: np.ndarray,
+    root: Relaxations,
+    gap: float,
+    spent: float,
+    results: list[SearchResult | None],
+) -> None:
+    """Results of the searches that one compiled call closes; they share its time by the relaxations they solved."""
+    begin, compiled = time.perf_counter(), relaxer.compiling
+    found = relaxer.decide(instances, index, root, gap)
+    seconds = time.perf_counter() - begin - (relaxer.compiling - compiled)
+    share = seconds * found.nodes / found.nodes.sum()
+    for lane, i in enumerate(index):
+        if found.closed[lane]:
+            results[i] = SearchResult(
+                np.asarray(found.x[lane]),
+                float(found.value[lane]),
+                float(found.bound[lane]),
+                OPTIMAL,
+                FINISHERS[int(found.finished_by[lane])],
+                int(found.nodes[lane]),
+                root.start(i),
+                spent + float(share[lane]),
+            )
 
 
 def _closed_by_root(

@@ -6,6 +6,7 @@ the whole moves of all of them side by side on the host.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import time
@@ -27,7 +28,8 @@ from jaxmpc.integer import FINISHES
 from jaxmpc.newton import WarmStart
 from jaxmpc.packing import Packing
 from jaxmpc.plan import Planner
-from jaxmpc.relaxer import Relaxer, Solved, relax, relaxations
+from jaxmpc.relaxation import Solved, relax
+from jaxmpc.relaxer import Relaxer, relaxations
 from jaxmpc.step_response import StepResponseModel, check_match
 from jaxmpc.step_solver import StepSolver
 from jaxmpc.structure import Structure, check_vector
@@ -85,6 +87,16 @@ class MixedIntegerControllers:
         )
         self._packings: dict[Any, Any] = {}
         self._scales: dict[Relaxer, tuple[Lanes, np.ndarray]] = {}
+
+    def part(self, index: np.ndarray) -> MixedIntegerControllers:
+        """The controllers of some scenarios, which share what is computed already."""
+        if self.count == len(index) and (index == np.arange(self.count)).all():
+            return self
+        some = copy.copy(self)
+        some.__dict__.pop("constants", None)
+        some.count, some._packings, some._scales = len(index), {}, {}
+        some.solver, some.memory = self.solver.part(index), self.memory.take(index)
+        return some
 
     @functools.cached_property
     def constants(self) -> tuple[Lanes[CondensedQp], Any, Any]:
@@ -162,7 +174,7 @@ class MixedIntegerControllers:
         if root is None:  # otherwise all that is remembered is there already
             fits = roots.warm.row_price.shape[-1] == state.warm.row_price.shape[-1]
             warm = roots.warm if fits else state.warm
-            observed = state, free_response, instances, Solved(warm, *([np.zeros(self.count)] * 4))
+            observed = state, free_response, instances, Solved(warm, *([np.zeros(self.count)] * 5))
         state, moves, recovering = self._remember(relaxer, observed, x, good)
         certified = lambda values: np.where(good, values, np.nan)  # noqa: E731
         value, bound = (np.array([getattr(r, key) for r in results]) for key in ("value", "bound"))

@@ -4,7 +4,8 @@ With the prices of a neighbouring problem (the previous sample, the parent node)
 outside or at the edge of their deadzone, and most limits to be active or not. Every row becomes a proximal
 term with its price (Hermans, Themelis and Patrinos 2022, QPALM), whose gradient is piecewise linear, so that a Newton step
 is exact as soon as the classification is right. From a start with prices that takes one to three steps. Without
-any, the terms are soft at first and stiffer with every problem solved, which finds the classification in about four.
+any, the terms are soft at first and stiffer with every problem solved, which finds the classification in about four. Where
+kinks lie so close that steps get nowhere, they are damped and the terms soft again.
 What is returned is judged by its own duality gap; `relaxation` turns to the interior point of `qp` when that is not closed.
 CV limits count as hard here: where they cannot be met for their weight, the interior point has to decide what is given up.
 """
@@ -30,18 +31,15 @@ from jaxmpc.relaxed_problem import (
     total,
 )
 
-STEPS = 40  # Newton steps after which a start is given up
-SOFT, STIFF = (
-    10.0,
-    1e4,
-)  # curvature of a proximal term against the largest of the Hessian: without prices, and in the end
-STIFFEN = 10.0  # what it grows by when the problem with the present prices is solved
+STEPS = 60  # Newton steps after which a start is given up
+# curvature of a proximal term against the largest of the Hessian: without prices, in the end, and the least there is
+SOFT, STIFF, SOFTEST = 10.0, 1e4, 0.1
+STIFFEN = 10.0  # what it grows by when the problem with the present prices is solved, and falls by after a short step
+SHORT = 0.003  # step length from which on the next step is damped
+DAMPING, MOST_DAMPING, DAMP = 1e-4, 10.0, 10.0  # on the diagonal after short steps, and what that changes by
 SEARCHES = 12  # trials of the line search
 FLAT = 0.3  # share of its slope at the start that the merit may have where a line search ends
-SETTLED, EXACT = (
-    1e-7,
-    1e-12,
-)  # share of the gradient without moves that is left when prices are taken, and at the end
+SETTLED, EXACT = 1e-7, 1e-12  # share of the gradient without moves left when prices are taken, and at the end
 UNPAID, OUTSIDE = (
     1e-14,
     1e-9,
@@ -208,13 +206,18 @@ def refine(
         moved = jax.tree.map(lambda new, old: new - old, prices, state.prices)
         change = sum(jnp.sum(m**2 / sigma) for m, sigma in zip(moved, proximal.sigma, strict=True))
         outside = jnp.max(jnp.abs(moved.hard) / proximal.sigma.hard, initial=0.0)
+        # a kink close by stops a step that has hardly any curvature before it: shorter ones get on
+        short = alpha < SHORT
+        stiffer = jnp.minimum(STIFFEN * state.stiffness, STIFF)
+        softer = jnp.maximum(state.stiffness / STIFFEN, SOFTEST)
+        damped = jnp.clip(DAMP * state.ridge, DAMPING, MOST_DAMPING)
         good = jnp.all(jnp.isfinite(x))
         after = _State(
             x=x,
             t=t,
             prices=jax.tree.map(lambda new, old: jnp.where(settled, new, old), prices, state.prices),
-            stiffness=jnp.where(settled, jnp.minimum(STIFFEN * state.stiffness, STIFF), state.stiffness),
-            ridge=state.ridge,
+            stiffness=jnp.where(settled, stiffer, jnp.where(short, softer, state.stiffness)),
+            ridge=jnp.where(short, damped, jnp.maximum(state.ridge / DAMP, RIDGE)),
             steps=state.steps + 1,
             done=exact & (change < UNPAID) & (outside < OUTSIDE),
         )

@@ -17,10 +17,11 @@ from jaxmpc import html
 from jaxmpc import status as codes
 from jaxmpc.blocking import first_position_rows, moves_per_block, sample_moves
 from jaxmpc.condense import DRIFT, QpInstance, dynamic_matrix, make_instance
+from jaxmpc.constants import Constants
 from jaxmpc.errors import InputError
 from jaxmpc.integer import FINISHES, continuous_feasible
 from jaxmpc.newton import WarmStart
-from jaxmpc.relaxer import Constants, Relaxer
+from jaxmpc.relaxer import Relaxer
 from jaxmpc.search import SearchResult
 from jaxmpc.step_response import StepResponseModel, check_match
 from jaxmpc.step_solver import StepSolver

@@ -8,7 +8,7 @@ the interior point sees only the lanes that need it.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ from jaxmpc.condense import CondensedQp, QpInstance
 from jaxmpc.gram import SUMMED_LIMIT, running_sums
 from jaxmpc.newton import WarmStart, refine, warm_start_of
 from jaxmpc.qp import solve
-from jaxmpc.relaxed_problem import QpSolution, prepare
+from jaxmpc.relaxed_problem import QpSolution, evaluate, prepare
 from jaxmpc.status import FAILED, OPTIMAL
 
 ROUGH = 1e-9  # relative gap at which the interior point stops
@@ -28,6 +28,7 @@ ENOUGH = 1e-7  # residual from which on a solution is not improved
 WIDTH = 1024  # lanes of a batch that go in lockstep on an accelerator
 LEFT = 4  # they stop when one in so many is unfinished, and leave the room to others
 AXIS = "relaxed lane"
+ROW_ROUNDING = 1e-6  # slack of the hard rows of rounded moves, which are whole numbers themselves
 
 
 def solve_relaxed(
@@ -287,3 +288,25 @@ def shifted_start(start: WarmStart, cvs: int, horizon: int) -> WarmStart:
     return eqx.tree_at(
         lambda s: (s.row_price, s.limit_price), start, (moved(start.row_price), moved(start.limit_price))
     )
+
+
+class Solved(NamedTuple):
+    """What a search reads of one relaxed problem, or of a batch; see `relaxer.Relaxations`."""
+
+    warm: WarmStart
+    objective: Any
+    bound: Any
+    snapped: Any
+    status: Any
+    steps: Any
+
+
+def relax(qp: CondensedQp, rows, integer, instance: QpInstance, lower, upper, start: WarmStart) -> Solved:
+    """Relax one problem within limits of the moves, and evaluate its moves with the integer ones rounded."""
+    s = solve_relaxed(qp, rows, instance, lower, upper, start)
+    snapped = s.x.at[integer].set(jnp.round(s.x[integer]))
+    w = rows @ snapped
+    fits = jnp.all((w <= instance.row_high + ROW_ROUNDING) & (w >= instance.row_low - ROW_ROUNDING))
+    fits &= jnp.all((snapped <= instance.upper + ROW_ROUNDING) & (snapped >= instance.lower - ROW_ROUNDING))
+    value = jnp.where(fits, evaluate(qp, instance, snapped), jnp.inf)
+    return Solved(warm_start_of(s), s.objective, s.bound, value, s.status, s.iterations)

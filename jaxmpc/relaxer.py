@@ -6,58 +6,31 @@ the Newton matrices of all lanes are one matrix product; what differs is picked 
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.batch import lanes_of
-from jaxmpc.blocking import hard_rows
-from jaxmpc.condense import CondensedQp, QpInstance, integer_columns
-from jaxmpc.levelset import assignment_order, leading_factor, root_factor, schur_complement
-from jaxmpc.newton import WarmStart, warm_start_of
+from jaxmpc.batch import Lanes, lanes_of
+from jaxmpc.compiled_search import Decision, Tables, decide, searchable
+from jaxmpc.condense import QpInstance
+from jaxmpc.constants import Constants
+from jaxmpc.newton import WarmStart
 from jaxmpc.packing import Packing
-from jaxmpc.relaxation import cold_start, solve_relaxed
-from jaxmpc.relaxed_problem import evaluate
-from jaxmpc.structure import Structure
+from jaxmpc.relaxation import Solved, relax
 
 SIZES = (1, 8, 64)  # lanes of a call, one compiled program each; a batch is padded to the least that holds it
 SINGLY = 3  # problems up to which calls of one lane are faster than a padded batch
 WIDE = 128  # variables from which problems are solved one by one
-ROW_ROUNDING = 1e-6  # slack of the hard rows of rounded moves, which are whole numbers themselves
 
 _COMPILED: set = set()  # forms of the relaxation that this process has called before
-
-
-class Constants:
-    """What the search needs of a `CondensedQp`, computed once per structure, model and tuning."""
-
-    def __init__(self, structure: Structure, qp: CondensedQp):
-        self.structure, self.qp = structure, qp
-        self.rows = hard_rows(structure)
-        predictions = structure.cv_count * structure.horizon_count
-        self.cold = jax.tree.map(np.asarray, cold_start(qp, len(self.rows), predictions))
-        self.integer = integer_columns(structure)
-        self.scales = np.asarray(qp.scale)  # MV units per unit of x
-        hessian = np.asarray(qp.hessian)
-        self.schur, self.radius = schur_complement(hessian, self.integer)
-        self.root_factor = root_factor(self.schur)
-        self.order = assignment_order(structure.block_count, len(structure.integer_mvs))
-        self.leading = leading_factor(self.schur[np.ix_(self.order, self.order)])
-        self.slope = np.asarray(qp.soft_linear)[predictions:]  # of the envelope rows
-        self.knot = np.asarray(qp.deadzone)[predictions:]
-        self.levels = len(self.slope) // max(len(self.integer), 1)
-        self.scale = max(float(np.diag(np.asarray(qp.curvature)).max()), 1e-12)
-        full = np.diag(np.asarray(qp.curvature))[self.integer]
-        self.own_weight = (
-            0.5 * (full - np.diag(hessian)[self.integer]) if self.levels else np.zeros(len(self.integer))
-        )
 
 
 @dataclasses.dataclass
@@ -72,6 +45,7 @@ class Relaxations:
         gradient: price of the lower less that of the upper limit of x, the slope of the optimum in a fixed move.
         envelope: prices of the envelope rows.
         warm: moves and prices, to start neighbours from.
+        steps: Newton steps and interior-point iterations.
     """
 
     x: np.ndarray
@@ -82,6 +56,12 @@ class Relaxations:
     gradient: np.ndarray
     envelope: np.ndarray
     warm: WarmStart
+    steps: np.ndarray
+
+    @property
+    def solved(self) -> Solved:
+        """What came back from the compiled call."""
+        return Solved(self.warm, self.objective, self.bound, self.snapped, self.status, self.steps)
 
     def start(self, lane: int) -> WarmStart:
         """Moves and prices of one lane."""
@@ -93,25 +73,18 @@ class Relaxations:
         return Relaxations(**{k: jax.tree.map(lambda leaf: leaf[begin:end], v) for k, v in own.items()})
 
 
-class Solved(NamedTuple):
-    """What a search reads of one relaxed problem, or of a batch; see `Relaxations`."""
+@functools.partial(jax.jit, static_argnames=("structure", "packings"))
+def _decide(structure, shared, own, rows, problems, index, roots, gap, packings):
+    """Searches of lanes that belong to the scenarios `index`; goes in and comes out packed."""
+    of_instances, of_solved = packings
+    pick = lambda tree: jax.tree.map(lambda leaf: leaf[index], tree)  # noqa: E731
 
-    warm: WarmStart
-    objective: Any
-    bound: Any
-    snapped: Any
-    status: Any
+    def lane(own, instance, root):
+        qp, tables = eqx.combine(own, shared)
+        return decide(structure, qp, tables, rows, instance, root, gap)
 
-
-def relax(qp: CondensedQp, rows, integer, instance: QpInstance, lower, upper, start: WarmStart) -> Solved:
-    """Relax one problem within limits of the moves, and evaluate its moves with the integer ones rounded."""
-    s = solve_relaxed(qp, rows, instance, lower, upper, start)
-    snapped = s.x.at[integer].set(jnp.round(s.x[integer]))
-    w = rows @ snapped
-    fits = jnp.all((w <= instance.row_high + ROW_ROUNDING) & (w >= instance.row_low - ROW_ROUNDING))
-    fits &= jnp.all((snapped <= instance.upper + ROW_ROUNDING) & (snapped >= instance.lower - ROW_ROUNDING))
-    value = jnp.where(fits, evaluate(qp, instance, snapped), jnp.inf)
-    return Solved(warm_start_of(s), s.objective, s.bound, value, s.status)
+    found = jax.vmap(lane)(pick(own), of_instances.unpack(problems[index]), of_solved.unpack(roots))
+    return Packing.of(found).pack(found)
 
 
 @functools.partial(jax.jit, static_argnames="packings")
@@ -146,6 +119,7 @@ def relaxations(solved: Solved, predictions: int) -> Relaxations:
         gradient=-box_price,
         envelope=row_price[:, predictions:],
         warm=solved.warm,
+        steps=solved.steps,
     )
 
 
@@ -172,9 +146,22 @@ class Relaxer:
         start = WarmStart(*(numbers(size) for size in sizes))
         self.of_lanes = Packing.of((numbers(n), numbers(n), start))
         self.solved_shapes = Solved(
-            start, numbers(), numbers(), numbers(), jax.ShapeDtypeStruct((1,), jnp.int32)
+            start, numbers(), numbers(), numbers(), *(jax.ShapeDtypeStruct((1,), jnp.int32),) * 2
         )
         self.of_solved = Packing.of(self.solved_shapes)
+        shapes: Any = (jax.ShapeDtypeStruct((1,), t) for t in (bool, jnp.float64, jnp.int64))
+        flag, number, code = shapes
+        self.of_decision = Packing.of(Decision(flag, numbers(n), number, number, code, code, code))
+
+    def part(self, index: np.ndarray) -> Relaxer:
+        """The relaxations of some scenarios; nothing is compiled or computed again."""
+        some = copy.copy(self)
+        some.compiling = 0.0
+        if not self.one:
+            some.constants, some.lanes = [self.constants[i] for i in index], self.lanes.take(index)
+            if self.tables is not None:
+                some.tables = self.tables.take(index)
+        return some
 
     def scenario(self, index: int) -> Constants:
         """Constants of a scenario."""
@@ -212,6 +199,49 @@ class Relaxer:
             self.of_solved.unpack(parts[0] if len(parts) == 1 else np.concatenate(parts)), self.predictions
         )
 
+    @functools.cached_property
+    def tables(self) -> Lanes[Tables] | None:
+        """What compiled searches read; None where they do not know the structure."""
+        return lanes_of([Tables.of(c) for c in self.constants]) if searchable(self.structure) else None
+
+    def decide(self, instances: QpInstance, index: np.ndarray, roots: Relaxations, gap: float) -> Decision:
+        """Search scenarios in compiled programs, as far as these go.
+
+        Args:
+            instances: problems of all scenarios, first axis ``"scenario"``.
+            index: scenarios to search.
+            roots: relaxations of all scenarios.
+            gap: relative gap.
+        """
+        assert self.tables is not None
+        of_instances, count = Packing.of(instances), len(index)
+        problems = of_instances.pack(jax.tree.map(np.asarray, instances))
+        solved = self.of_solved.pack(roots.solved)
+        shared, own = (self.lanes.shared, self.tables.shared), (self.lanes.each, self.tables.each)
+        parts, begin = [], 0
+        while begin < count:
+            size = next((s for s in self.sizes if s >= count - begin), self.sizes[-1])
+            pad = np.minimum(begin + np.arange(size), count - 1)
+            lanes = solved[index[pad]]
+            lanes[count - begin :] = np.nan  # no root: nothing is searched
+            packings = of_instances, self.of_solved
+            arguments = (
+                self.structure,
+                shared,
+                own,
+                self.hard,
+                problems,
+                index[pad],
+                lanes,
+                max(gap, 1e-9),
+                packings,
+            )
+            form = "decide", problems.shape, lanes.shape, packings, jax.tree.structure((shared, own))
+            parts.append(self._timed(form, lambda a=arguments: np.asarray(_decide(*a)))[: count - begin])
+            begin += size
+        found = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        return self.of_decision.unpack(found)
+
     def compile(self, instances: QpInstance, warm: WarmStart) -> None:
         """Compile what searches call: single problems and small batches, and large ones where there are many scenarios."""
         lower, upper = np.asarray(instances.lower), np.asarray(instances.upper)
@@ -240,13 +270,17 @@ class Relaxer:
         return self.solve(instances, index, lower, upper, jax.tree.map(np.asarray, warm))
 
     def _call(self, problems, index, lanes, of_instances: Packing) -> np.ndarray:
-        """Call the relaxation; a first call compiles, which is not held against a time limit."""
+        """Call the relaxation; compilation is not held against a time limit."""
         packings = of_instances, self.of_lanes, self.of_solved
         arguments = (self.lanes.shared, self.lanes.each, self.hard, self.columns, problems, index, lanes)
         form = problems.shape, lanes.shape, packings, jax.tree.structure(arguments)
+        return self._timed(form, lambda: np.asarray(_relax(*arguments, packings=packings)))
+
+    def _timed(self, form, call):
+        """The result of a compiled call; what a first call of its form takes is counted as compilation."""
         if form not in _COMPILED:
             begin = time.perf_counter()
-            jax.block_until_ready(_relax(*arguments, packings=packings))
+            call()
             _COMPILED.add(form)
             self.compiling += time.perf_counter() - begin
-        return np.asarray(_relax(*arguments, packings=packings))
+        return call()

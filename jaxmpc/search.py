@@ -14,10 +14,11 @@ import jax
 import numpy as np
 
 from jaxmpc.condense import QpInstance
+from jaxmpc.constants import Constants
 from jaxmpc.levelset import LowerModel
 from jaxmpc.newton import WarmStart
 from jaxmpc.propagation import Chain, chains_of, nearest, satisfied
-from jaxmpc.relaxer import Constants, Relaxations
+from jaxmpc.relaxer import Relaxations
 from jaxmpc.status import FAILED, INFEASIBLE, LIMIT, OPTIMAL
 
 GROUP = 8  # problems a search asks for at once: as many as one small batch holds

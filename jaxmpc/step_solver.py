@@ -6,6 +6,7 @@ engineering units.
 
 from __future__ import annotations
 
+import copy
 import functools
 from collections.abc import Callable, Sequence
 
@@ -14,11 +15,12 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmpc.condense import DRIFT, CondensedQp, QpInstance, condense, integer_columns
+from jaxmpc.constants import Constants
 from jaxmpc.errors import InputError
 from jaxmpc.integer import solve_integers
 from jaxmpc.newton import WarmStart
 from jaxmpc.propagation import chains_of, nearest
-from jaxmpc.relaxer import Constants, Relaxations, Relaxer
+from jaxmpc.relaxer import Relaxations, Relaxer
 from jaxmpc.search import SearchResult
 from jaxmpc.step_response import StepResponseModel
 from jaxmpc.structure import Structure
@@ -60,6 +62,14 @@ class StepSolver:
             each = [made[id(t), id(m)] for t, m in zip(self.tunings, self.models, strict=True)]
             self._relaxers[envelope] = Relaxer(each[:1] if len(made) == 1 else each)
         return self._relaxers[envelope]
+
+    def part(self, index: np.ndarray) -> StepSolver:
+        """The solver of some scenarios."""
+        some = copy.copy(self)
+        some._relaxers = {envelope: relaxer.part(index) for envelope, relaxer in self._relaxers.items()}
+        if len(self.tunings) > 1:
+            some.tunings, some.models = [self.tunings[i] for i in index], [self.models[i] for i in index]
+        return some
 
     def _qp(self, tuning: Tuning, model: StepResponseModel, envelope: int) -> CondensedQp:
         return _condense(
@@ -107,12 +117,10 @@ class StepSolver:
         instances = instances_of(relaxer)
         if root is None:
             relaxer, instances = self._reaching(relaxer, instances, instances_of)
-        integer, count = relaxer.integer, len(instances.lower)
+        count = len(instances.lower)
         starts: list[list[np.ndarray]] = [[] for _ in range(count)]
         if previous_moves is not None:
-            for i, moves in enumerate(previous_moves):
-                wanted = moves.T.reshape(-1)[integer] / relaxer.scenario(i).scales[integer]
-                starts[i].append(np.clip(np.nan_to_num(wanted), -1e6, 1e6))
+            starts = self.starts(relaxer, previous_moves)
         results, root = solve_integers(
             relaxer,
             instances,
@@ -124,6 +132,14 @@ class StepSolver:
             finish=finish,
         )
         return relaxer, instances, results, root
+
+    def starts(self, relaxer: Relaxer, previous_moves: np.ndarray) -> list[list[np.ndarray]]:
+        """The integer moves of plans ``"scenario block mv"`` [MV unit], to be tried as incumbents."""
+        integer, starts = relaxer.integer, []
+        for i, moves in enumerate(previous_moves):
+            wanted = moves.T.reshape(-1)[integer] / relaxer.scenario(i).scales[integer]
+            starts.append([np.clip(np.nan_to_num(wanted), -1e6, 1e6)])
+        return starts
 
     def _reaching(self, relaxer: Relaxer, instances: QpInstance, instances_of: InstancesOf):
         """Constants with an envelope as wide as the integer ranges, and the problems for them, their limits finite."""

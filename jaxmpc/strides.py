@@ -1,35 +1,46 @@
-"""A mixed-integer controller on the JAX well, from one sample that has to be searched to the next in one compiled call.
+"""Mixed-integer controllers on the JAX well, many samples in one compiled call.
 
-In most samples the relaxed moves are whole already, or rounding them costs less than the gap: the relaxation closes them.
-Nothing then needs the host: decision, plant and next sample stay on the device, with the very functions that
-`mixed_integer` calls, until a sample needs a search. One call carries out what the search decided and goes on.
+Nearly every sample is closed by its relaxation or by `compiled_search`. Decision, plant and next sample then stay on the
+device, with the very functions that `mixed_integer` calls, until a sample has to be searched on the host. One call carries
+out what was decided there and goes on.
 """
 
 from __future__ import annotations
 
 import functools
+import threading
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxmpc import status as codes
-from jaxmpc.condense import QpInstance
+from jaxmpc.batch import Lanes
+from jaxmpc.compiled_search import decide
+from jaxmpc.condense import QpInstance, integer_columns
 from jaxmpc.controller import ControllerState
+from jaxmpc.integer import UNINTERRUPTED, solve_integers
 from jaxmpc.mixed_integer import MixedIntegerControllers, observed, relative_gap, remembered
 from jaxmpc.packing import Packing
 from jaxmpc.plant import WellPlant, WellState
-from jaxmpc.relaxer import Solved, relaxations
+from jaxmpc.relaxation import Solved
+from jaxmpc.relaxer import relaxations
+from jaxmpc.structure import Structure
+from jaxmpc.threads import parts_of, side_by_side
 
 LONGEST = 32  # samples of one call
+TOGETHER = 16  # scenarios of one call
+APART = 5  # Newton steps that take as long as the rest of a sample
+RELAXATION = codes.finisher_code("relaxation")
 
 
 class Sample(NamedTuple):
-    """A sample whose measurement is known; all arrays with a scenario axis of one.
+    """A sample whose measurement is known; all arrays with a scenario axis.
 
     Attributes:
         state: of the controller, after the measurement.
@@ -43,26 +54,29 @@ class Sample(NamedTuple):
 
     state: ControllerState
     plant: WellState
-    cv: Float[Array, "1 cv"]
+    cv: Float[Array, "scenario cv"]
     instance: QpInstance
     root: Solved
-    x: Float[Array, "1 n"]
-    good: Bool[Array, "1"]
-    decided: Bool[Array, "1"]
+    x: Float[Array, "scenario n"]
+    good: Bool[Array, " scenario"]
+    decided: Bool[Array, " scenario"]
 
 
 class Seen(NamedTuple):
-    """What the record keeps of a measured sample."""
+    """What is kept of a measured sample: fields of `Trajectory`, and the steps that its solves took."""
 
     cv: Array
     bias: Array
     bias_raw: Array
     objective: Array
     bound: Array
+    nodes: Array
+    finished_by: Array
+    steps: Array
 
 
 class Done(NamedTuple):
-    """What the record keeps of a sample that was carried out."""
+    """What is kept of a sample that was carried out."""
 
     mv_demand: Array
     mv: Array
@@ -70,213 +84,333 @@ class Done(NamedTuple):
     plan: Array
 
 
+class Loop(NamedTuple):
+    """Everything that stays the same from sample to sample."""
+
+    memory: Lanes
+    qps: Lanes
+    tables: Lanes
+    rows: Any
+    scales: Lanes
+    plants: Lanes[WellPlant]
+
+
 def able(controllers: MixedIntegerControllers) -> bool:
-    """Whether samples can be closed by the relaxation alone: one model, moves of one step, no way to finish prescribed."""
-    plain = type(controllers) is MixedIntegerControllers and controllers.count == 1
-    return plain and controllers.solver.narrow and controllers.finish == "auto"
+    """Whether samples can be closed on the device: moves of one step, no way to finish prescribed, no short time limit."""
+    plain = type(controllers) is MixedIntegerControllers and controllers.finish == "auto"
+    unhurried = controllers.time_limit is None or controllers.time_limit >= UNINTERRUPTED
+    return (
+        plain and unhurried and controllers.solver.narrow and controllers.solver.relaxer(1).tables is not None
+    )
 
 
 def simulate_in_strides(
     controllers: MixedIntegerControllers,
-    plant: WellPlant,
+    plants: Lanes[WellPlant],
     inputs: tuple[np.ndarray, np.ndarray, np.ndarray],
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> dict[str, np.ndarray]:
-    """A closed loop of one controller; the fields of `Trajectory` that are recorded, ``"sample ..."``.
+    """Closed loops of controllers that advance together; the fields of `Trajectory`, ``"scenario sample ..."``.
 
-    The samples of a call share its time; what a search takes is charged to its sample.
+    A single controller is searched in a call of its own, whose time is charged to the sample. Otherwise the samples of a
+    call share its time by the steps of their solves, and what the host does is charged to its sample.
 
     Args:
-        controllers: one, see `able`.
-        plant: the well.
-        inputs: setpoints ``"sample cv"``, pressure offsets ``"sample"`` [bar] and measurement errors ``"sample cv"``.
-        progress: called with ``(done, total)`` samples.
+        controllers: see `able`.
+        plants: one well for all, or one per scenario.
+        inputs: setpoints ``"scenario sample cv"``, pressure offsets ``"scenario sample"`` [bar] and measurement errors
+            ``"scenario sample cv"``.
+        progress: told how many samples of all scenarios were done, first when everything is compiled; by one thread at a
+            time.
     """
-    run = _Run(controllers, plant, inputs)
-    fields: dict[str, np.ndarray] = {}
-    total, done, sample = len(inputs[0]), 0, run.start()
-    while done < total:
-        begin = time.perf_counter()
-        acted = bool(sample.decided[0])  # only the first call has nothing to carry out
-        sample, seen, doings, steps = run.stride(sample, done)
-        # the first row of what was seen is the sample after the one that was carried out first
-        first, count = done + acted, steps
-        taken = (time.perf_counter() - begin) / max(steps, 1)
-        carried = steps - 1 + acted
-        for name, values in doings._asdict().items():
-            _put(fields, total, name, done, values[:carried])
-        done += carried
-        for name, values in seen._asdict().items():
-            _put(fields, total, name, first, values[:count])
-        closed = {
-            "status": codes.OPTIMAL,
-            "fallback": False,
-            "nodes": 1,
-            "finished_by": codes.finisher_code("relaxation"),
-        }
-        for name, value in closed.items():
-            _put(fields, total, name, first, np.full(count, value))
-        _put(fields, total, "solve_time", first, np.full(count, taken))
-        if done < total and not sample.decided[0]:
-            sample, found = run.search(sample)
-            for name, value in found.items():
-                _put(fields, total, name, done, np.asarray([value]))
-            fields["solve_time"][done] += run.seconds
+    lock, count = threading.Lock(), controllers.count
+    parts = parts_of(count, TOGETHER)
+    runs = [_Run(controllers.part(part), plants.take(part), [v[part] for v in inputs]) for part in parts]
+    stages = [run.start() for run in runs]  # the first compiles
+    real = [min(len(part), count - int(part[0])) for part in parts]
+
+    def tick(samples: int) -> None:
         if progress is not None:
-            progress(min(done, total), total)
-    scale = controllers.solver.relaxer(1).scenario(0).scale
-    fields["gap"] = relative_gap(fields["objective"], fields["bound"], scale)
+            with lock:
+                progress(samples)
+
+    def advance(k: int, stopped: Callable[[], bool]) -> dict[str, np.ndarray]:
+        fields = _advanced(runs[k], stages[k], lambda samples: tick(real[k] * samples), stopped)
+        return {name: values[: real[k]] for name, values in fields.items()}
+
+    tick(0)
+    fields = side_by_side(advance, range(len(parts)))
+    return {name: np.concatenate([f[name] for f in fields]) for name in fields[0]}
+
+
+def _advanced(run: _Run, stage: _Stage, tick: Callable[[int], None], stopped: Callable[[], bool]) -> dict:
+    """The whole run of some controllers."""
+    fields: dict[str, np.ndarray] = {}
+    total, done = run.samples, 0
+    while done < total and not stopped():
+        begin = time.perf_counter()
+        acted = int(stage.decided)  # only the first call has nothing to carry out
+        stage, seen, doings, count = run.stride(stage, done)
+        seconds = time.perf_counter() - begin
+        # the first row of what was seen is the sample after the one that was carried out first
+        first, carried = done + acted, count - 1 + acted
+        for name, values in doings._asdict().items():
+            _put(fields, total, name, done, values[:, :carried])
+        work = seen.steps[:, :count] + APART
+        shares = {"solve_time": seconds * work / work.sum()}
+        for name, values in (seen._asdict() | shares).items():
+            if name != "steps":
+                _put(fields, total, name, first, np.asarray(values[:, :count]))
+        _put(fields, total, "status", first, np.full((run.count, count), codes.OPTIMAL))
+        _put(fields, total, "fallback", first, np.full((run.count, count), False))
+        before, done = done, done + carried
+        if done < total and not stage.decided:
+            stage = run.decide(stage, fields, done)
+        if carried:
+            tick(min(done, total) - before)
+    scale = run.controllers.scales_of(run.narrow)[1]
+    fields["gap"] = relative_gap(fields["objective"], fields["bound"], scale[:, None])
     return fields
 
 
 def _put(fields: dict[str, np.ndarray], total: int, name: str, begin: int, values: np.ndarray) -> None:
-    """Write rows of a field, made when first needed; what is beyond the run is dropped."""
+    """Write samples of a field, made when first needed; what is beyond the run is dropped."""
     if name not in fields:
-        fields[name] = np.empty((total, *values.shape[1:]), dtype=values.dtype)
-    fields[name][begin : begin + len(values)] = values[: max(total - begin, 0)]
+        fields[name] = np.empty((len(values), total, *values.shape[2:]), dtype=values.dtype)
+    fields[name][:, begin : begin + values.shape[1]] = values[:, : max(total - begin, 0)]
+
+
+class _Stage(NamedTuple):
+    """A packed sample, on the device or the host, and whether all of it is decided."""
+
+    packed: Any
+    decided: bool
 
 
 class _Run:
-    """A loop under way.
+    """Loops under way.
 
     Args:
-        controllers: one.
-        plant: the well.
-        inputs: as in `simulate_in_strides`.
+        controllers, plants, inputs: as in `simulate_in_strides`, of scenarios that share every call.
     """
 
-    def __init__(self, controllers: MixedIntegerControllers, plant: WellPlant, inputs):
-        self.controllers, self.plant = controllers, plant
-        self.inputs = [np.concatenate([v, np.repeat(v[-1:], LONGEST + 1, axis=0)]) for v in inputs]
-        self.narrow = controllers.solver.relaxer(1)
-        well = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64)[None], plant)
-        self.of_well = Packing.of(well)
-        self.constants = (
-            controllers.memory,
-            *controllers.constants,
-            controllers.scales_of(self.narrow)[0],
-            jax.device_put(self.of_well.pack(well)),
+    def __init__(self, controllers: MixedIntegerControllers, plants: Lanes[WellPlant], inputs):
+        self.controllers, self.plants, self.count = controllers, plants, controllers.count
+        self.samples = inputs[0].shape[1]
+        self.inputs = np.concatenate([inputs[0], inputs[2], inputs[1][..., None]], axis=2)
+        # beyond the end the last sample is repeated
+        self.inputs = np.concatenate(
+            [self.inputs, np.repeat(self.inputs[:, -1:], LONGEST + 1, axis=1)], axis=1
         )
-        self.seconds = 0.0  # of the last search
+        self.narrow = controllers.solver.relaxer(1)
+        assert self.narrow.tables is not None
+        memory, (qps, rows, _) = controllers.memory, controllers.constants
+        loop = Loop(memory, qps, self.narrow.tables, rows, controllers.scales_of(self.narrow)[0], plants)
+        # flat, as taking the modules apart at every call takes longer than a sample
+        arrays, rest = eqx.partition(loop, eqx.is_array_like)
+        self.leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(arrays)]
+        self.form = jax.tree.structure(arrays), rest
+        scale = controllers.scales_of(self.narrow)[1]
+        self.gaps = np.stack([np.full(self.count, max(controllers.gap, 1e-9)), 1e-6 * scale], axis=1)
 
-    def start(self) -> Sample:
+    def start(self) -> _Stage:
         """Before the first sample, everything compiled."""
-        c, setpoints = self.controllers, self.inputs[0]
-        steady = self.plant.init()
-        plant_state = jax.tree.map(lambda leaf: np.asarray(leaf)[None], steady)
-        outputs = self.plant.measure(steady)
-        state = c.init(np.asarray(outputs.cv)[None], np.asarray(outputs.mv)[None])
-        cv: Any = np.asarray(outputs.cv)[None] + self.inputs[2][:1]
-        memory, qps, rows, columns, *_ = self.constants
-        shapes = jax.eval_shape(observed, memory, qps, rows, columns, state, cv, setpoints[:1])
+        c, steady = self.controllers, _steady(self.plants, self.count)
+        plant_state, outputs = jax.tree.map(np.asarray, steady)
+        state = c.init(outputs.cv, outputs.mv)
+        cvs = outputs.cv.shape[1]
+        cv: Any = outputs.cv + self.inputs[:, 0, cvs : 2 * cvs]
+        memory, (qps, rows, columns) = c.memory, c.constants
+        shapes = jax.eval_shape(observed, memory, qps, rows, columns, state, cv, cv)
         _, _, instance, root = jax.tree.map(lambda v: np.zeros(v.shape, v.dtype), shapes)
-        no: Any = np.zeros(1, dtype=bool)
+        no: Any = np.zeros(self.count, dtype=bool)
         sample = Sample(state, plant_state, cv, instance, root, np.zeros_like(root.warm.x), no, no)
         self.of_sample = Packing.of(sample)
-        later, *_ = self.stride(sample, 0)
-        self.narrow.compile(later.instance, later.state.warm)
-        return sample
+        statics = _Statics(c.structure, self.form, self.of_sample, self.count > 1)
+        self.program, self.search = _programs(statics)
+        stage = _Stage(self.of_sample.pack(sample), False)
+        later, *_ = self.stride(stage, 0)
+        if self.count == 1:
+            jax.block_until_ready(self.search(self.leaves, later.packed, self.gaps))
+        return stage
 
-    def stride(self, sample: Sample, begin: int) -> tuple[Sample, Seen, Done, int]:
+    def stride(self, stage: _Stage, begin: int) -> tuple[_Stage, Seen, Done, int]:
         """Carry out sample `begin` if it is decided, and go on up to one that is not.
 
         Returns:
-            ``(sample, seen, done, count)``: the sample measured last, what was measured since, what was carried out, and how
+            ``(stage, seen, done, count)``: the sample measured last, what was measured since, what was carried out, and how
             many samples were measured.
         """
-        setpoints, offsets, errors = (v[begin : begin + LONGEST + 1] for v in self.inputs)
-        gap = np.array([max(self.controllers.gap, 1e-9), self.narrow.scenario(0).scale])
-        packed, seen, done, count = _stride(
-            *self.constants,
-            self.of_sample.pack(sample),
-            (setpoints, offsets, errors, gap),
-            packings=(self.of_well, self.of_sample),
-        )
+        now = self.inputs[:, begin : begin + LONGEST + 1]
+        packed, (seen, done), (count, decided) = self.program(self.leaves, stage.packed, now, self.gaps)
         rows = lambda tree: jax.tree.map(np.asarray, tree)  # noqa: E731
-        return self.of_sample.unpack(np.asarray(packed)), rows(seen), rows(done), int(count)
+        return _Stage(packed, bool(decided)), rows(seen), rows(done), int(count)
 
-    def search(self, sample: Sample) -> tuple[Sample, dict[str, Any]]:
-        """Decide a sample on the host: the sample, and what the record keeps of the decision."""
-        c = self.controllers
-        _, _, (result,), _ = c.solver.solve(
-            lambda _: sample.instance,
+    def decide(self, stage: _Stage, fields: dict[str, np.ndarray], at: int) -> _Stage:
+        """Decide sample `at`, alone or on the host, and record how."""
+        begin = time.perf_counter()
+        if self.count == 1:
+            packed, found = self.search(self.leaves, stage.packed, self.gaps)
+            objective, bound, nodes, finished_by, closed = np.asarray(found)[0]
+            if closed:
+                found = dict(objective=objective, bound=bound, nodes=nodes, finished_by=finished_by)
+                for name, value in found.items():
+                    fields[name][0, at] = value
+                fields["solve_time"][0, at] += time.perf_counter() - begin
+                return _Stage(packed, True)
+        seconds = time.perf_counter() - begin
+        return self._on_host(stage, fields, at, seconds)
+
+    def _on_host(self, stage: _Stage, fields: dict[str, np.ndarray], at: int, seconds: float) -> _Stage:
+        c, packed = self.controllers, np.array(stage.packed)
+        sample: Sample = self.of_sample.unpack(packed)
+        which = np.flatnonzero(~sample.decided)
+        starts = c.solver.starts(self.narrow, np.asarray(sample.state.plan))
+        results, _ = solve_integers(
+            self.narrow,
+            sample.instance,
+            starts=starts,
             root=relaxations(sample.root, self.narrow.predictions),
-            previous_moves=np.asarray(sample.state.plan),
-            warm=sample.state.warm,
             gap=c.gap,
             time_limit=c.time_limit,
-            finish=c.finish,
+            which=which,
+            searched=True,
         )
-        self.seconds = result.seconds
-        known = bool(np.isfinite(sample.cv).all())
-        good = known and result.x is not None
-        found = {
-            "status": result.status if known else codes.FAILED,
-            "fallback": not good,
-            "nodes": result.nodes,
-            "finished_by": codes.finisher_code(result.finished_by) if good else 0,
-            "objective": result.value if good else np.nan,
-            "bound": result.bound if good else np.nan,
-        }
-        x = sample.x if result.x is None else result.x[None]
-        flags: Any = {"good": np.array([good]), "decided": np.array([True])}
-        return sample._replace(x=x, **flags), found
+        x, good = sample.x.copy(), sample.good.copy()
+        for i, result in zip(which, results, strict=True):
+            known = bool(np.isfinite(sample.cv[i]).all())
+            good[i] = known and result.x is not None
+            found = {
+                "status": result.status if known else codes.FAILED,
+                "fallback": not good[i],
+                "nodes": result.nodes,
+                "finished_by": codes.finisher_code(result.finished_by) if good[i] else 0,
+                "objective": result.value if good[i] else np.nan,
+                "bound": result.bound if good[i] else np.nan,
+            }
+            for name, value in found.items():
+                fields[name][i, at] = value
+            fields["solve_time"][i, at] += result.seconds + seconds
+            if result.x is not None:
+                x[i] = result.x
+        decided: Any = np.ones(self.count, dtype=bool)
+        return _Stage(self.of_sample.pack(sample._replace(x=x, good=good, decided=decided)), True)
 
 
-@functools.partial(jax.jit, static_argnames="packings")
-def _stride(memory, qps, rows, columns, scales, well, sample, inputs, packings):
-    """See `_Run.stride`; the sample comes and goes packed."""
-    setpoints, offsets, errors, (gap, scale) = inputs
-    one = lambda tree: jax.tree.map(lambda leaf: leaf[0], tree)  # noqa: E731
-    lane = lambda tree: jax.tree.map(lambda leaf: leaf[None], tree)  # noqa: E731
-    plant: WellPlant = one(packings[0].unpack(well))
-    sample = packings[1].unpack(sample)
+def _steady(plants: Lanes[WellPlant], count: int):
+    def lane(own, _):
+        plant: WellPlant = eqx.combine(own, plants.shared)
+        state = plant.init()
+        return state, plant.measure(state)
+
+    return jax.vmap(lane)(plants.each, np.zeros(count))
+
+
+class _Statics(NamedTuple):
+    """What programs are compiled for; `inside` says whether strides search."""
+
+    structure: Structure
+    form: Any
+    of_sample: Packing
+    inside: bool
+
+
+@functools.lru_cache(maxsize=64)
+def _programs(statics: _Statics):
+    """The compiled stride and search of loops of one form."""
+    return jax.jit(functools.partial(_stride, statics)), jax.jit(functools.partial(_search, statics))
+
+
+def _loop(statics: _Statics, leaves) -> Loop:
+    form, rest = statics.form
+    return eqx.combine(jax.tree.unflatten(form, leaves), rest)
+
+
+def _decided(structure: Structure, loop: Loop, instance, root: Solved, gaps):
+    """The compiled search of all scenarios whose root has a bound."""
+
+    def lane(own, instance, root, gap):
+        qp, tables = eqx.combine(own, (loop.qps.shared, loop.tables.shared))
+        return decide(structure, qp, tables, loop.rows, instance, root, gap)
+
+    return jax.vmap(lane)((loop.qps.each, loop.tables.each), instance, root, gaps[:, 0])
+
+
+def _search(statics: _Statics, leaves, packed, gaps):
+    """Search a packed sample: the same, decided where that was possible, and what the record keeps."""
+    sample: Sample = statics.of_sample.unpack(packed)
+    root = sample.root
+    known = jnp.isfinite(sample.cv).all(axis=1)
+    root = root._replace(bound=jnp.where(known, root.bound, jnp.nan))
+    found = _decided(statics.structure, _loop(statics, leaves), sample.instance, root, gaps)
+    sample = sample._replace(x=found.x, good=found.closed, decided=found.closed)
+    record = found.value, found.bound, found.nodes, found.finished_by, found.closed
+    return statics.of_sample.pack(sample), jnp.stack([v.astype(float) for v in record], axis=1)
+
+
+def _stride(statics: _Statics, leaves, packed, inputs, gaps):
+    """See `_Run.stride`."""
+    loop, sample = _loop(statics, leaves), statics.of_sample.unpack(packed)
+    columns = np.asarray(integer_columns(statics.structure))
+    cvs, mvs = sample.cv.shape[1], sample.state.mv.shape[1]
+    setpoints, errors, offsets = inputs[..., :cvs], inputs[..., cvs : 2 * cvs], inputs[..., -1]
     late = sample.decided[0].astype(int)  # measured is sample `late`, then late + 1, ...
 
-    def carry_out(sample: Sample) -> tuple[Sample, Done]:
+    def carry_out(sample: Sample, at) -> tuple[Sample, Done]:
         state, moves, _ = remembered(
-            memory, scales, sample.instance, sample.state, sample.x, sample.good, sample.root.warm
+            loop.memory, loop.scales, sample.instance, sample.state, sample.x, sample.good, sample.root.warm
         )
-        return sample._replace(state=state), Done(state.mv[0], state.mv[0], moves[0, 0], moves[0])
+
+        def advance(own, plant_state, mv, offset):
+            return eqx.combine(own, loop.plants.shared).step(plant_state, mv, offset)
+
+        plant_state, outputs = jax.vmap(advance)(loop.plants.each, sample.plant, state.mv, offsets[:, at])
+        sample = sample._replace(state=state, plant=plant_state, cv=outputs.cv + errors[:, at + 1])
+        return sample, Done(state.mv, outputs.mv, moves[:, 0], moves)
 
     def forward(carry):
         sample, seen, done, count = carry
         at = late + count - 1  # sample to carry out; -1 for none
 
-        def advance(sample: Sample):
-            sample, did = carry_out(sample)
-            plant_state, outputs = plant.step(one(sample.plant), did.mv_demand, offsets[at])
-            cv = outputs.cv + errors[at + 1]
-            return sample._replace(plant=lane(plant_state), cv=cv[None]), did._replace(mv=outputs.mv)
+        def nothing(sample: Sample, _):
+            return sample, jax.tree.map(lambda v: jnp.zeros((v.shape[0], *v.shape[2:]), v.dtype), done)
 
-        def nothing(sample: Sample):
-            return sample, jax.tree.map(lambda v: jnp.zeros(v.shape[1:], v.dtype), done)
-
-        sample, did = jax.lax.cond(at >= 0, advance, nothing, sample)
+        sample, did = jax.lax.cond(at >= 0, carry_out, nothing, sample, at)
         row = jnp.where(at >= 0, at, LONGEST + 1)  # out of range: not written
-        done = jax.tree.map(lambda rows, new: rows.at[row].set(new, mode="drop"), done, did)
+        done = jax.tree.map(lambda rows, new: rows.at[:, row].set(new, mode="drop"), done, did)
         state, _, instance, root = observed(
-            memory, qps, rows, columns, sample.state, sample.cv, setpoints[at + 1][None]
+            loop.memory, loop.qps, loop.rows, columns, sample.state, sample.cv, setpoints[:, at + 1]
         )
         assert root is not None
         bound = jnp.maximum(root.bound, 0.0)
-        size = jnp.maximum(jnp.abs(root.snapped), 1e-6 * scale)
-        closed = jnp.isfinite(root.snapped) & (root.snapped - bound <= gap * size)
-        closed &= jnp.isfinite(sample.cv).all(axis=1)
+        size = jnp.maximum(jnp.abs(root.snapped), gaps[:, 1])
+        known = jnp.isfinite(sample.cv).all(axis=1)
+        closed = known & jnp.isfinite(root.snapped) & (root.snapped - bound <= gaps[:, 0] * size)
         x = root.warm.x
         x = x.at[:, columns].set(jnp.round(x[:, columns]))
-        now = Seen(sample.cv, state.bias, state.bias_raw, root.snapped, jnp.minimum(bound, root.snapped))
-        seen = jax.tree.map(lambda rows, new: rows.at[count].set(new[0]), seen, now)
+        value, bound, steps = root.snapped, jnp.minimum(bound, root.snapped), root.steps.astype(int)
+        nodes, finished_by = jnp.ones_like(steps), jnp.full_like(steps, RELAXATION)
+        if statics.inside:
+            open_root = root._replace(bound=jnp.where(closed | ~known, jnp.nan, root.bound))
+            found = _decided(statics.structure, loop, instance, open_root, gaps)
+            pick = lambda new, old: jnp.where(found.closed.reshape(-1, *[1] * (old.ndim - 1)), new, old)  # noqa: E731
+            x, value, bound = pick(found.x, x), pick(found.value, value), pick(found.bound, bound)
+            nodes, finished_by = pick(found.nodes, nodes), pick(found.finished_by, finished_by)
+            steps, closed = steps + found.steps, closed | found.closed
+        now = Seen(sample.cv, state.bias, state.bias_raw, value, bound, nodes, finished_by, steps)
+        seen = jax.tree.map(lambda rows, new: rows.at[:, count].set(new), seen, now)
         sample = sample._replace(state=state, instance=instance, root=root, x=x, good=closed, decided=closed)
         return sample, seen, done, count + 1
 
     def onward(carry):
         sample, *_, count = carry
-        return (count == 0) | (sample.decided[0] & (count < LONGEST))
+        return (count == 0) | (sample.decided.all() & (count < LONGEST))
 
-    cvs, mvs = setpoints.shape[1], sample.state.mv.shape[1]
-    table = lambda *shape: jnp.zeros((LONGEST + 1, *shape))  # noqa: E731
-    seen = Seen(table(cvs), table(cvs), table(cvs), table(), table())
+    def table(*shape, dtype=float):
+        return jnp.zeros((sample.cv.shape[0], LONGEST + 1, *shape), dtype=dtype)
+
+    whole = lambda: table(dtype=int)  # noqa: E731
+    seen = Seen(table(cvs), table(cvs), table(cvs), table(), table(), whole(), whole(), whole())
     done = Done(table(mvs), table(mvs), table(mvs), table(*sample.state.plan.shape[1:]))
     sample, seen, done, count = jax.lax.while_loop(onward, forward, (sample, seen, done, 0))
-    return packings[1].pack(sample), seen, done, count
+    return statics.of_sample.pack(sample), (seen, done), (count, sample.decided.all())

@@ -39,7 +39,7 @@ def advance_together(
     """
     setpoints, offsets = inputs
     count, samples = setpoints.shape[:2]
-    errors = np.asarray(_errors(*noise, np.arange(samples)))
+    errors = errors_of(*noise, np.arange(samples))
     mesh = variant_mesh(jax.local_devices()[:1])
     at = lambda k: per_lane(np.full(count, k, dtype=np.int32))  # noqa: E731
     state, outputs = map_lanes(_start, [plants, at(0)], mesh)
@@ -63,6 +63,11 @@ def advance_together(
         if (k + 1) % REPORT == 0 or k + 1 == samples:
             tick(count * (k % REPORT + 1))
     return fields
+
+
+def errors_of(deviation: np.ndarray, seeds: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    """Measurement errors ``"scenario sample cv"``; arguments as in `advance_together`."""
+    return np.asarray(_errors(deviation, seeds, samples))
 
 
 @jax.jit

@@ -143,7 +143,7 @@ def test_neither_pieces_of_lanes_nor_of_samples_nor_padding_change_results(lanes
     pieces = run(lanes_at_once=2)
     assert [list(piece.lanes) for piece in pieces] == [[0, 1], [2, 3], [4]]
     in_pieces = whole(pieces)  # the third piece was half copies
-    monkeypatch.setattr("jaxmpc.closed_loop.CHUNK", 9)
+    monkeypatch.setattr("jaxmpc.compiled_loop.CHUNK", 9)
     in_time = whole(run())  # two samples too many
     for name in at_once:
         if name in ("nodes", "gap", "bound", "solve_time"):

@@ -7,13 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmpc import status
+from jaxmpc import compiled_search, status
+from jaxmpc.compiled_search import Tables
 from jaxmpc.condense import condense, make_instance
+from jaxmpc.constants import Constants
 from jaxmpc.cuts import Cuts
 from jaxmpc.integer import FINISHES, solve_integer, solve_integers
 from jaxmpc.levelset import enumerate_below, exclude
 from jaxmpc.propagation import Chain, nearest, propagate, satisfied
-from jaxmpc.relaxer import Constants, Relaxer
+from jaxmpc.relaxer import Relaxer
 from jaxmpc.scheduling import run
 from jaxmpc.search import Search
 
@@ -191,3 +193,44 @@ def test_an_expired_time_limit_returns_a_feasible_plan_with_its_true_gap(problem
         assert result.bound <= values.min() * (1 + 1e-8)
         seen.add(result.status)
     assert status.LIMIT in seen
+
+
+def searched(structure, problem):
+    """What the compiled search finds for one of `problems`."""
+    constants, instance, _, _ = problem
+    relaxer = Relaxer([constants])
+    root = relaxer.solve_roots(one(instance), one(constants.cold)).solved
+    lane = lambda tree: jax.tree.map(lambda leaf: leaf[0], tree)  # noqa: E731
+    return jax.jit(
+        lambda instance, root: compiled_search.decide(
+            structure, constants.qp, Tables.of(constants), relaxer.rows, instance, root, 1e-6
+        )
+    )(instance, lane(root))
+
+
+@pytest.mark.parametrize("free", [compiled_search.GRID_FREE, 0])
+def test_the_compiled_search_finds_the_best_whole_plan_and_proves_it(
+    small_structure, problems, monkeypatch, free
+):
+    """From the grid of all combinations, and from the list that is made move by move."""
+    monkeypatch.setattr(compiled_search, "GRID_FREE", free)
+    closed = 0
+    for problem in problems:
+        found = searched(small_structure, problem)
+        if found.closed:
+            best = problem[3].min()
+            assert float(found.value) == pytest.approx(best, rel=1e-6, abs=1e-9)
+            assert float(found.bound) <= best * (1.0 + 1e-9) + 1e-12
+            assert float(found.value - found.bound) <= 1e-6 * max(best, 1e-6 * problem[0].scale)
+            closed += 1
+    assert closed >= 10  # the others are left to the host, which solves all of them
+
+
+def test_a_list_that_does_not_fit_is_not_claimed_to_be_done(small_structure, problems, monkeypatch):
+    monkeypatch.setattr(compiled_search, "GRID_FREE", 0)
+    monkeypatch.setattr(compiled_search, "LONGEST", 256)
+    monkeypatch.setattr(compiled_search, "MOST_SOLVED", 2)
+    for problem in problems:
+        found = searched(small_structure, problem)
+        if found.closed:
+            assert float(found.value) == pytest.approx(problem[3].min(), rel=1e-6, abs=1e-9)
