@@ -210,6 +210,14 @@ def test_the_site_builds_without_warnings(tmp_path):
     assert done.returncode == 0, warnings
     for page in tmp_path.glob("*.html"):
         assert "<p>```" not in page.read_text(), f"a block of {page.name} is not read as code"
+    mathematics = (tmp_path / "mathematics.html").read_text()
+    assert mathematics.count("<math") > 50
+    assert "arithmatex" not in mathematics, "a formula is shown as it is typed"
+    for page in tmp_path.rglob("*.html"):
+        fetched = re.findall(
+            r'<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)="((?:https?:)?//[^"]*)"', page.read_text()
+        )
+        assert fetched == [], f"{page.name} needs a network"
 
 
 # ---------------------------------------------------------------------------------------------------- notebook
