@@ -196,13 +196,9 @@ def _study_sweep(options: argparse.Namespace, given: dict[str, Any]) -> int:
     try:
         study = load_study(options.study, quick=options.quick, confirmed=dry or "yes" in given)
     except InputError as error:
-        if error.field != "study.confirmation_limit":
-            raise
-        hint = "Give --yes to run them all, --dry-run to see how long that takes"
-        raise InputError(error.field, error.value, error.expected, hint) from None
+        raise InputError(error.field, error.value, error.expected, _hint(error, options.study)) from None
     if dry:
-        print(study.describe())
-        return EXIT_OPTIMAL
+        return _dry_run(study, options, given)
     from studies.sweep.runner import RunError, run_study
     from studies.sweep.search_study import SearchStudy
 
@@ -224,6 +220,30 @@ def _study_sweep(options: argparse.Namespace, given: dict[str, Any]) -> int:
     draw_sweep(path, folder)
     print(f"Results: {path}, figures: {folder}")
     print(f"Look at them with: jaxmpc study export {path} {path.stem}.csv")
+    return EXIT_OPTIMAL
+
+
+def _hint(error: InputError, study: str) -> str:
+    """What to do about a definition that is refused."""
+    from studies.sweep.fields import near
+
+    if error.field == "study.confirmation_limit":
+        return "Give --yes to run them all, --dry-run to see how long that takes"
+    if error.field == "study" and not Path(study).exists():
+        return error.hint or near(study, COMPARISONS)
+    return error.hint
+
+
+def _dry_run(study: Any, options: argparse.Namespace, given: dict[str, Any]) -> int:
+    from studies.sweep.status import status_of
+
+    print(study.describe())
+    found = status_of(given.get("store", options.out / f"{study.name}.zarr"), study.hash)
+    if found is not None:
+        print(f"so far      {found.so_far}", *filter(None, [found.pace]), sep="\n")
+    limit = study.definition.study.confirmation_limit
+    more = f" and with --yes: it has more than {limit} scenarios (study.confirmation_limit)"
+    print(f"To run it, give the command without --dry-run{more if study.count > limit else ''}.")
     return EXIT_OPTIMAL
 
 

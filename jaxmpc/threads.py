@@ -17,13 +17,14 @@ import jax
 import numpy as np
 
 T = TypeVar("T")
+THREADS = "JAXMPC_THREADS"  # environment variable with the number of threads
 
 
 def cores() -> int:
     """Threads to use: ``JAXMPC_THREADS`` if set, else the cores that this process may run on; 1 on an accelerator."""
     if jax.default_backend() != "cpu":
         return 1
-    given = os.environ.get("JAXMPC_THREADS", "")
+    given = os.environ.get(THREADS, "")
     return max(int(given), 1) if given.isdigit() else len(os.sched_getaffinity(0))
 
 

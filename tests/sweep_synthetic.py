@@ -57,7 +57,9 @@ def numbers(count, seed=0, cvs=2):
     }
 
 
-def write(path, keys, values, figures, trajectories=None, definition=None, skip=(), chunk_size=8):
+def write(
+    path, keys, values, figures, trajectories=None, definition=None, skip=(), chunk_size=8, provenance=None
+):
     """A store with these columns and key figures; the chunks in `skip` are not computed."""
     count = len(values[0])
     columns = []
@@ -80,7 +82,7 @@ def write(path, keys, values, figures, trajectories=None, definition=None, skip=
             "mv": (["choke", "gas_lift"], "", "manipulated variable"),
             "mv_unit": (["%", "m3/h"], "", "unit of the MV"),
         },
-        provenance={"definition": definition} if definition is not None else {},
+        provenance={**(provenance or {}), **({"definition": definition} if definition is not None else {})},
     )
     fields = {**figures, **(trajectories or {})}
     with SweepStore.begin(path, layout, lambda line: None) as store:

@@ -199,8 +199,19 @@ def test_a_dry_run_says_what_to_expect_and_writes_nothing(file, started, tmp_pat
     out = capsys.readouterr().out
     for line in ("scenarios   8", "chunks      3", "models      2", "MB", "minutes"):
         assert line in out
+    assert out.endswith("To run it, give the command without --dry-run.\n")
     assert started == []
     assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_dry_run_of_a_study_that_has_begun_says_how_much_is_stored(file, serial, tmp_path, capsys):
+    assert main(["study", "run", str(file), "--dry-run", "--store", str(serial)]) == 0
+    out = capsys.readouterr().out
+    assert "so far      8 of 8 scenarios (100%), 3 of 3 chunks" in out
+    assert "scenarios per second" in out
+    file.write_text(TEXT.replace("values = [100, 200]", "values = [100, 300]"))
+    assert main(["study", "run", str(file), "--dry-run", "--store", str(serial)]) == 0
+    assert "so far" not in capsys.readouterr().out  # the store is of another definition
 
 
 def test_more_scenarios_than_the_limit_need_a_confirmation(file, started, capsys):
@@ -211,6 +222,7 @@ def test_more_scenarios_than_the_limit_need_a_confirmation(file, started, capsys
     assert "--yes" in err
     assert started == []
     assert main(["study", "run", str(file), "--dry-run"]) == 0
+    assert "without --dry-run and with --yes: it has more than 7 scenarios" in capsys.readouterr().out
     assert main(["study", "run", str(file), "--yes"]) == 0
     assert started[0]["command"] == f"{file} --yes"
 
@@ -225,6 +237,7 @@ def test_more_scenarios_than_the_limit_need_a_confirmation(file, started, capsys
         (["thesis", "--yes"], ["--yes"]),
         (["deadzone", "--plant", "jax"], ["--plant", "thesis"]),
         (["deadzon"], ["deadzone", "blocking", "mismatch", "robustness"]),
+        (["tesis"], ["Did you mean thesis?"]),
         (["nosuch.toml"], ["nosuch.toml", "definition file"]),
     ],
 )

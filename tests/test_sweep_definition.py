@@ -12,6 +12,7 @@ from jaxmpc.errors import InputError
 from jaxmpc.well import WellParameters
 from studies import fingerprint, presets, references
 from studies.sweep.definition import StudyDefinition, load_definition, shipped_studies
+from studies.sweep.estimate import MODEL_SECONDS
 from studies.sweep.fields import FIELDS, PLANT_FIELDS
 from studies.sweep.models import identify_models
 from studies.sweep.scenarios import load_study
@@ -434,13 +435,14 @@ def test_the_quick_cut_replaces_what_it_names_and_nothing_else():
 def test_a_dry_run_counts_scenarios_compilations_models_and_bytes():
     base = {"reference": "quick", "duration": 1000}
     axes = [axis("controller", "continuous", "mixed-integer"), axis("model.choke", 20, 50, 80)]
-    description = expand(base, axes, store={"every": 10, "trajectories": ["cv", "status"]}).describe()
+    made = expand(base, axes, store={"every": 10, "trajectories": ["cv", "status"]})
+    description = made.describe()
     assert description.scenarios == 6
     assert description.group_sizes == (3, 3)
     assert (description.chunks, description.compilations, description.models) == (2, 2, 3)
     assert description.samples == 600
     assert description.stored_bytes == 6 * 8 * (64 + 10 * 3)
-    assert description.seconds == pytest.approx(3 + 2 * 20 + 300 / 4000 + 300 / 800)
+    assert description.seconds == pytest.approx(3 * MODEL_SECONDS + made.work.rest({}))
     assert "scenarios   6" in str(description)
 
 

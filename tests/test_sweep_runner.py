@@ -392,6 +392,41 @@ def test_a_cluster_and_processes_at_once_are_refused(study, tmp_path):
         run(study, tmp_path / "x.zarr", dask="tcp://127.0.0.1:8786", workers=2)
 
 
+@pytest.fixture
+def cluster():
+    """A cluster in this process, which has no worker yet."""
+    distributed = pytest.importorskip("distributed")
+    options = dict(
+        n_workers=0, threads_per_worker=1, processes=False, protocol="tcp://", dashboard_address=None
+    )
+    with distributed.LocalCluster(**options) as made:
+        yield made
+
+
+def test_a_cluster_without_workers_is_waited_for(study, serial, cluster, tmp_path):
+    said = []
+
+    def say(line):
+        said.append(line)
+        if "no worker yet" in line:
+            cluster.scale(1)
+
+    same(run(study, tmp_path / "x.zarr", dask=cluster.scheduler_address, say=say), serial)
+    assert said[0] == "The cluster has no worker yet; the run begins as soon as there is one."
+
+
+def test_workers_of_other_code_are_refused_with_what_to_do_and_compute_nothing(
+    study, cluster, monkeypatch, tmp_path
+):
+    cluster.scale(1)
+    monkeypatch.setattr("studies.sweep.executors._code", lambda: "of another version")
+    monkeypatch.setattr("studies.sweep.executors.run_chunk", lambda *_: pytest.fail("a chunk was computed"))
+    with pytest.raises(
+        RunError, match=r"other code.*install the same version on all workers\. 0 of 3 chunks"
+    ):
+        run(study, tmp_path / "x.zarr", dask=cluster.scheduler_address)
+
+
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nosuch://host:8786", "no port", ""])
 def test_an_address_without_a_scheduler_is_refused_with_nothing_written(
     address, study, monkeypatch, tmp_path

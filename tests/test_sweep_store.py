@@ -642,6 +642,11 @@ def test_missing_results_say_what_to_do(tmp_path):
     for read in (open_study, kpi_frame, status):
         with pytest.raises(InputError, match="Run the study first"):
             read(tmp_path / "a.zarr")
+    for name in ("one", "two"):
+        (tmp_path / f"{name}.zarr").mkdir()
+    for near in (tmp_path, tmp_path / "three.zarr"):
+        with pytest.raises(InputError, match=r"This folder holds one\.zarr, two\.zarr"):
+            status(near)
 
 
 def test_the_table_has_a_row_per_scenario_and_a_column_per_channel(tmp_path, reference):
@@ -662,6 +667,12 @@ def test_a_table_in_csv_reads_back(tmp_path, reference):
     target = export(tmp_path / "reference.zarr", tmp_path / "out" / "table.csv")
     read = pd.read_csv(target, index_col="scenario")
     pd.testing.assert_frame_equal(read, kpi_frame(tmp_path / "reference.zarr"), check_dtype=False)
+
+
+def test_a_table_in_parquet_is_the_table_with_its_types(tmp_path, reference):
+    pytest.importorskip("pyarrow")
+    target = export(tmp_path / "reference.zarr", tmp_path / "table.parquet")
+    pd.testing.assert_frame_equal(pd.read_parquet(target), kpi_frame(tmp_path / "reference.zarr"))
 
 
 def test_netcdf_holds_everything(tmp_path, reference):
@@ -701,7 +712,7 @@ def test_an_export_that_fails_leaves_the_file_as_it_was(tmp_path, reference, mon
 
 def test_parquet_without_its_library_says_how_to_get_it(tmp_path, reference, monkeypatch):
     monkeypatch.setattr(exporting.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(MissingToolError, match="pip install pyarrow"):
+    with pytest.raises(MissingToolError, match=r"pip install 'jaxmpc\[parquet\]'"):
         export(tmp_path / "reference.zarr", tmp_path / "table.parquet")
 
 
@@ -731,6 +742,7 @@ def test_the_status_counts_and_ends_with_what_to_do(tmp_path, reference):
     hurt = status(path)
     assert hurt.chunks_done == 1
     assert "Damaged: fallbacks/c.0 (checksum differs)" in str(hurt)
+    assert "To compute what is damaged or missing again" in str(hurt)
     run(path, study)
     whole = status(path)
     assert whole.failed == int((reference.complete == 0).sum()) > 0

@@ -80,7 +80,7 @@ def run_chunk(prepared: PreparedStudy, index: int) -> ChunkResult:
     fields, facts = run_scenarios(
         [study.scenario(int(k)) for k in chunk.scenarios],
         prepared.models,
-        lanes=min(study.chunk_size, len(study.groups[chunk.group].scenarios)),
+        lanes=study.lanes(chunk.group),
         shared_model=len(study.groups[chunk.group].points) == 1,
         plant_fields=study.varying_plant(chunk.group),
         points=len(stored_times(study)),
@@ -238,6 +238,7 @@ def study_layout(study: Study, command: str | None = None) -> StoreLayout:
             "seeds": {"sampling": study.definition.sampling.seed, "noise": noise},
             "versions": versions(),
             "settled": dict(zip(CV_NAMES, SETTLED, strict=True)),
+            "work": dataclasses.asdict(study.work),
             "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         },
     )

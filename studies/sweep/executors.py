@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
+import functools
 import logging
 import multiprocessing
 import os
+import platform
 import signal
 import threading
 import time
@@ -19,6 +21,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Protocol
 
 from jaxmpc.errors import InputError, MissingToolError
+from jaxmpc.threads import THREADS, cores
 from studies.sweep.chunk import ChunkResult, PreparedStudy, run_chunk
 from studies.sweep.scenarios import code_hash
 
@@ -28,7 +31,7 @@ ASK_SECONDS = 5.0  # between two questions how many workers a cluster has
 
 
 class LostError(RuntimeError):
-    """What was to compute the chunks is gone for good."""
+    """What was to compute the chunks is gone for good, or is not what it has to be."""
 
 
 class Executor(Protocol):
@@ -90,10 +93,11 @@ class Here:
 _received: PreparedStudy | None = None
 
 
-def _receive(prepared: PreparedStudy) -> None:
-    """Make a new process ready: keep the study, leave Ctrl-C to the parent, and end with it."""
+def _receive(prepared: PreparedStudy, workers: int) -> None:
+    """Make a new process ready: keep the study, share the cores, leave Ctrl-C to the parent, and end with it."""
     global _received
     _received = prepared
+    os.environ.setdefault(THREADS, str(max(cores() // workers, 1)))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is not None:
@@ -119,7 +123,7 @@ class Processes:
 
     def _make(self) -> concurrent.futures.ProcessPoolExecutor:
         return concurrent.futures.ProcessPoolExecutor(
-            self.workers, multiprocessing.get_context("spawn"), _receive, (self.prepared,)
+            self.workers, multiprocessing.get_context("spawn"), _receive, (self.prepared, self.workers)
         )
 
     def submit(self, index: int) -> concurrent.futures.Future[ChunkResult]:
@@ -197,14 +201,22 @@ def disconnect(client: Any) -> None:
         client.status = "closed"  # it would try again when it is collected
 
 
-def _hold(prepared: PreparedStudy, code: str) -> PreparedStudy:
+_code = functools.cache(code_hash)  # a worker is asked with every chunk
+
+
+def _hold(prepared: PreparedStudy) -> PreparedStudy:
     """On a worker: what all its chunks share; as a task it is computed again wherever it is lost."""
-    if code_hash() != code:
-        raise RuntimeError(
-            "a worker of the cluster has other code of jaxmpc or studies than this process; install the same "
-            "version on all of them"
-        )
     return prepared
+
+
+def _run_held(prepared: PreparedStudy, index: int, code: str) -> ChunkResult:
+    """On a worker: a chunk, unless the worker would compute it by other code than it is stored under."""
+    if _code() != code:
+        raise LostError(
+            f"worker {platform.node()} of the cluster has other code of jaxmpc or studies than this process; "
+            "install the same version on all workers"
+        )
+    return run_chunk(prepared, index)
 
 
 class Cluster:
@@ -212,7 +224,7 @@ class Cluster:
 
     def __init__(self, prepared: PreparedStudy, client: Any, say: Callable[[str], None]):
         self.client, self.address = client, client.scheduler.address
-        self.prepared = client.submit(_hold, prepared, code_hash(), pure=False)
+        self.prepared, self.code = client.submit(_hold, prepared, pure=False), code_hash()
         self.executor = client.get_executor(pure=False, retries=0)
         self._threads, self._asked = 0, -ASK_SECONDS
         if self.width == AHEAD and not self._threads:
@@ -230,7 +242,7 @@ class Cluster:
     def submit(self, index: int) -> concurrent.futures.Future[ChunkResult]:
         """As in `Executor`."""
         self.check()
-        return self.executor.submit(run_chunk, self.prepared, index)
+        return self.executor.submit(_run_held, self.prepared, index, self.code)
 
     def check(self) -> None:
         """As in `Executor`; a scheduler that is lost and comes back knows nothing of this run."""

@@ -49,11 +49,14 @@ def export(path: str | Path, target: str | Path, format: str | None = None, over
         )
     if target.is_dir() or (target.exists() and not overwrite):
         raise InputError(
-            "target", str(target), "a file that does not exist yet", "Pass overwrite, or another name"
+            "target",
+            str(target),
+            "a file that does not exist yet",
+            "Give another name, or --overwrite (overwrite=True) to replace it",
         )
     if kind == "parquet" and importlib.util.find_spec("pyarrow") is None:
         raise MissingToolError(
-            "Parquet files need pyarrow, which is not installed: pip install pyarrow. CSV and netCDF need nothing."
+            "Parquet files need pyarrow, which is not installed: pip install 'jaxmpc[parquet]'. CSV and netCDF need nothing."
         )
     if kind == "netcdf":
         data = _netcdf_ready(open_study(path))

@@ -176,7 +176,9 @@ def open_manifest(path: str | Path) -> tuple[Path, dict[str, Any]]:
     if manifest is None:
         if (store / COMMITS).is_dir():
             raise InputError("store", str(store), f"an undamaged store ({MANIFEST} is missing)", again)
-        raise InputError("store", str(store), "the store of a sweep study", "Run the study first")
+        beside = ", ".join(sorted(other.name for other in store.parent.glob("*.zarr") if other != store))
+        hint = f"This folder holds {beside}" if beside else "Run the study first: jaxmpc study run STUDY"
+        raise InputError("store", str(store), "the store of a sweep study", hint)
     if wrong := changed(store, manifest["files"], deep=True):
         named = ", ".join(f"{name} ({why})" for name, why in wrong.items())
         raise InputError("store", str(store), f"an undamaged store (damaged: {named})", again)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,8 @@ from tqdm import tqdm
 from jaxmpc.errors import InputError
 from studies.sweep.chunk import ChunkResult, PreparedStudy, prepare_study, study_layout
 from studies.sweep.executors import Cluster, Executor, Here, LostError, Processes, connect, disconnect
+from studies.sweep.progress import progress_bar
+from studies.sweep.reading import chunk_facts
 from studies.sweep.scenarios import Study
 from studies.sweep.store import SweepStore
 
@@ -80,13 +81,15 @@ def run_study(
         try:
             if missing:
                 prepared = prepare_study(study)
+                done = chunk_facts(writer.path)
+                stored = sum(len(study.chunks[i].scenarios) for i in done)
                 with (
                     _executor(prepared, workers, client, say) as executor,
-                    _bar(study, missing, progress) as tick,
+                    progress_bar(study.name, study.count, stored, study.work, done, progress) as bar,
                 ):
                     for result in _results(executor, missing, failed, say):
                         writer.commit(result.index, result.fields, result.facts)
-                        tick(result)
+                        bar.add(result.index, result.facts, len(study.chunks[result.index].scenarios))
         except KeyboardInterrupt:
             say(f"Stopped. {_stored(study, writer)} Give the same command again to go on.")
             raise
@@ -168,27 +171,11 @@ def _results(
             elif isinstance(error, concurrent.futures.BrokenExecutor) and tries[index] < TRIES:
                 suspects.append(index)
                 say(f"A worker died; chunk {index} is computed again.")
+            elif isinstance(error, LostError):
+                raise error
             else:
                 failed[index] = error
                 say(f"Chunk {index} failed: {type(error).__name__}: {error}")
                 if isinstance(error, concurrent.futures.BrokenExecutor) and len(failed) > 1 and not arrived:
                     raise LostError("no worker has lived long enough to compute a single chunk")
         executor.check()
-
-
-@contextlib.contextmanager
-def _bar(study: Study, missing: list[int], show: bool) -> Iterator[Callable[[ChunkResult], object]]:
-    """A bar of scenarios with rate and time left."""
-    often = 0.5 if sys.stderr.isatty() else 10.0  # s; a log file needs no more
-    stored = study.count - sum(len(study.chunks[i].scenarios) for i in missing)
-    with tqdm(
-        desc=study.name,
-        total=study.count,
-        initial=stored,
-        unit=" scenarios",
-        disable=not show,
-        dynamic_ncols=True,
-        mininterval=often,
-        smoothing=0.1,
-    ) as bar:
-        yield lambda result: bar.update(len(study.chunks[result.index].scenarios))

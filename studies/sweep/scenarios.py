@@ -25,14 +25,10 @@ from studies import fingerprint
 from studies.sweep import models
 from studies.sweep.axes import AxisTable, expand_axes
 from studies.sweep.definition import StudyDefinition, load_definition
+from studies.sweep.estimate import MODEL_SECONDS, Work, chunk_seconds, megabytes
 from studies.sweep.layout import Column
 from studies.sweep.resolve import Inputs, Variant, resolve, row
 
-# What a dry run expects, measured on 2 CPU cores with chunks of 64 scenarios; smaller chunks are slower per scenario.
-# Tunings that move the choke readily take several times as long.
-RATES = {"continuous": 4000.0, "mixed-integer": 800.0}  # samples of one scenario per second
-MODEL_SECONDS = 1.0  # identification of one model
-COMPILE_SECONDS = 20.0  # first chunk of a group
 KEY_FIGURES = 64  # numbers of a scenario besides trajectories
 NUMBER_BYTES = 8
 COMPUTING = (
@@ -126,7 +122,7 @@ class Description:
         models: step-response models to identify.
         samples: samples of all scenarios together.
         stored_bytes: key figures and trajectories before compression [B].
-        seconds: rough time on 2 CPU cores [s]: `RATES` for whole chunks, compilation and identification.
+        seconds: rough time on 2 CPU cores [s]: identification, and what the table of `estimate` says of the chunks.
     """
 
     name: str
@@ -150,8 +146,8 @@ class Description:
                 f"chunks      {self.chunks}",
                 f"to compile  {self.compilations}",
                 f"models      {self.models} to identify",
-                f"stored      {self.stored_bytes / 1e6:.1f} MB before compression",
-                f"time        about {self.seconds / 60:.1f} minutes on 2 CPU cores",
+                f"stored      {megabytes(self.stored_bytes)} before compression",
+                f"time        about {self.seconds / 60:.1f} minutes on 2 CPU cores; the run measures it by its own chunks",
             )
         )
 
@@ -251,6 +247,19 @@ class Study:
             list(self.scenario_hashes), columns, chunks, store.every, list(store.trajectories)
         )
 
+    def lanes(self, group: int) -> int:
+        """Scenarios of the compiled program of a group, padding included."""
+        return min(self.chunk_size, len(self.groups[group].scenarios))
+
+    @property
+    def work(self) -> Work:
+        """The chunks and what they are expected to cost."""
+        return Work(
+            groups=[chunk.group for chunk in self.chunks],
+            kinds=[group.kind for group in self.groups],
+            seconds=[chunk_seconds(g.kind, g.samples, self.lanes(i)) for i, g in enumerate(self.groups)],
+        )
+
     def describe(self) -> Description:
         """What a run would do, for a dry run; prints as a short table."""
         store = self.definition.store
@@ -259,10 +268,6 @@ class Study:
             widths[axis] for axis, names in AXES.items() for name in names if name in store.trajectories
         )
         points = math.ceil(max(group.samples for group in self.groups) / store.every)
-        seconds = MODEL_SECONDS * len(self.model_points) + COMPILE_SECONDS * len(self.groups)
-        for chunk in self.chunks:
-            group = self.groups[chunk.group]
-            seconds += self.chunk_size * group.samples / RATES[group.kind]
         return Description(
             name=self.name,
             scenarios=self.count,
@@ -272,7 +277,7 @@ class Study:
             models=len(self.model_points),
             samples=sum(len(group.scenarios) * group.samples for group in self.groups),
             stored_bytes=self.count * (KEY_FIGURES + kept * points) * NUMBER_BYTES,
-            seconds=seconds,
+            seconds=MODEL_SECONDS * len(self.model_points) + self.work.rest({}),
         )
 
     def _repr_html_(self) -> str:

@@ -9,7 +9,6 @@ This is the only file that uses optuna.
 from __future__ import annotations
 
 import contextlib
-import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +16,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from tqdm import tqdm
 
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.step_response import StepResponseModel
@@ -26,7 +24,8 @@ from studies.sweep.layout import FLAG
 from studies.sweep.models import Point as WorkingPoint
 from studies.sweep.models import identify_models
 from studies.sweep.objectives import costs, front, unbeaten, values_of
-from studies.sweep.reading import open_study
+from studies.sweep.progress import Progress, progress_bar
+from studies.sweep.reading import chunk_facts, open_study
 from studies.sweep.runner import Say
 from studies.sweep.scenarios import Study
 from studies.sweep.search_space import Parameter, Point
@@ -83,7 +82,8 @@ def run_search(
         if done:
             say(f"{done} of {study.batches} batches are stored already.")
         try:
-            with _bar(study, progress) as bar:
+            facts, work = chunk_facts(writer.path), study.work
+            with progress_bar(study.name, study.count, done * study.chunk_size, work, facts, progress) as bar:
                 _search(study, sampler, writer, missing, bar, say)
         except KeyboardInterrupt:
             done = study.batches - len(writer.pending())
@@ -96,13 +96,13 @@ def run_search(
 
 
 def _search(
-    study: SearchStudy, sampler: _Sampler, writer: SweepStore, missing: set[int], bar: tqdm, say: Say
+    study: SearchStudy, sampler: _Sampler, writer: SweepStore, missing: set[int], bar: Progress, say: Say
 ) -> None:
     stored = _Stored(study, writer.path) if len(missing) < study.batches else None
     runner, told = _Runner(study), []
     for index in range(study.batches):
         batch = study.batch(sampler.ask(index), index)
-        fields = None
+        fields, facts = None, None
         if stored is not None and index not in missing:
             fields = stored.results(batch, index)
             if fields is None:
@@ -114,8 +114,9 @@ def _search(
         values = values_of(study.objectives, fields)
         sampler.tell(values)
         told.append(costs(study.objectives, values))
-        bar.set_postfix(front=int(unbeaten(np.concatenate(told)).sum()), refresh=False)
-        bar.update(batch.count)
+        if facts is not None:
+            best = int(unbeaten(np.concatenate(told)).sum())
+            bar.add(index, facts, batch.count if index in missing else 0, f"{best} on the front")
 
 
 class _Runner:
@@ -242,18 +243,3 @@ class _Sampler:
 def _row(parameter: Parameter, asked: Any) -> tuple[Any, ...]:
     """One value per key for what was asked: a position among entries, or a number."""
     return parameter.entries[asked] if parameter.entries else (asked,)
-
-
-@contextlib.contextmanager
-def _bar(study: SearchStudy, show: bool) -> Iterator[tqdm]:
-    """A bar of scenarios with rate, time left and the size of the front."""
-    often = 0.5 if sys.stderr.isatty() else 10.0  # s; a log file needs no more
-    with tqdm(
-        desc=study.name,
-        total=study.count,
-        unit=" scenarios",
-        disable=not show,
-        dynamic_ncols=True,
-        mininterval=often,
-    ) as bar:
-        yield bar

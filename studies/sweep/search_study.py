@@ -20,11 +20,12 @@ from jaxmpc.errors import InputError
 from studies import fingerprint
 from studies.sweep.chunk import study_layout
 from studies.sweep.definition import StudyDefinition
+from studies.sweep.estimate import MODEL_SECONDS, Work, chunk_seconds
 from studies.sweep.fields import Field
 from studies.sweep.layout import StoreLayout, Variable
 from studies.sweep.objectives import Objective, objectives_of
 from studies.sweep.reading import chunk_facts, open_study
-from studies.sweep.scenarios import COMPILE_SECONDS, MODEL_SECONDS, RATES, Description, Study
+from studies.sweep.scenarios import Description, Study
 from studies.sweep.search_space import (
     Parameter,
     Point,
@@ -160,6 +161,13 @@ class SearchStudy:
             [fingerprint.module_hash(f"studies.{name}") for name in SEEKING],
         )
 
+    @property
+    def work(self) -> Work:
+        """The batches and what they are expected to cost."""
+        group = self.probe.groups[0]
+        seconds = chunk_seconds(group.kind, group.samples, self.chunk_size)
+        return Work([0] * self.batches, [group.kind], [seconds])
+
     def describe(self) -> SearchDescription:
         """What a run would do, for a dry run; prints as a short table."""
         group, each = self.probe.groups[0], self.probe.describe()
@@ -173,7 +181,7 @@ class SearchStudy:
             models=models,
             samples=samples,
             stored_bytes=each.stored_bytes // each.scenarios * self.count,
-            seconds=MODEL_SECONDS * models + COMPILE_SECONDS + samples / RATES[group.kind],
+            seconds=MODEL_SECONDS * models + self.work.rest({}),
         )
 
     def layout(self, command: str | None = None) -> StoreLayout:
@@ -202,6 +210,7 @@ class SearchStudy:
             variables=(*variables, *base.variables),
             provenance={
                 **base.provenance,
+                "work": dataclasses.asdict(self.work),
                 "tuned": tuned,
                 "objectives": {o.name: o.direction for o in self.objectives},
             },

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zarr
 
+from jaxmpc.errors import InputError
+from studies.sweep.estimate import Work, megabytes, readable
 from studies.sweep.layout import FLAG
 from studies.sweep.reading import read_small
-from studies.sweep.records import open_manifest, survey
+from studies.sweep.records import Survey, open_manifest, survey
 from studies.sweep.store import held
 
 
@@ -29,6 +34,8 @@ class StudyStatus:
         bytes: size of the files of the study [B].
         damaged: damaged files with what is wrong; their chunks are not among the stored ones.
         rate: scenarios per second of one worker, from the recorded wall times; NaN without any.
+        seconds_left: what one worker needs for the rest [s], every group by its own stored chunks (`estimate.Work`);
+            NaN where the store does not say what the chunks are.
         running: whether a run writes the store right now.
         definition: file that the study was run from, as far as its provenance says.
     """
@@ -43,21 +50,34 @@ class StudyStatus:
     bytes: int
     damaged: tuple[str, ...]
     rate: float
+    seconds_left: float
     running: bool
     definition: str = "STUDY.toml"
 
-    def __str__(self) -> str:
+    @property
+    def so_far(self) -> str:
+        """How much of the study is stored where."""
         share = self.scenarios_done / self.scenarios_total
-        lines = [
-            f"{self.title}: {self.scenarios_done} of {self.scenarios_total} scenarios ({share:.0%}), "
-            f"{self.chunks_done} of {self.chunks_total} chunks, {self.bytes / 1e6:.1f} MB in {self.store}"
-        ]
+        return (
+            f"{self.scenarios_done} of {self.scenarios_total} scenarios ({share:.0%}), "
+            f"{self.chunks_done} of {self.chunks_total} chunks, {megabytes(self.bytes)} in {self.store}"
+        )
+
+    @property
+    def pace(self) -> str:
+        """How fast it went and what the rest takes; empty where nothing was measured."""
+        if not np.isfinite(self.rate):
+            return ""
+        left = self.chunks_done < self.chunks_total and np.isfinite(self.seconds_left)
+        more = f"; it needs about {readable(self.seconds_left)} for the rest" if left else ""
+        return f"One worker computed {self.rate:.3g} scenarios per second{more}."
+
+    def __str__(self) -> str:
+        lines = [f"{self.title}: {self.so_far}"]
         if self.failed:
             lines.append(f"{self.failed} scenarios did not run to their end (complete = 0).")
-        if np.isfinite(self.rate):
-            rest = (self.scenarios_total - self.scenarios_done) / self.rate
-            left = f"; one worker needs {_duration(rest)} for the rest" if rest else ""
-            lines.append(f"One worker computes {self.rate:.3g} scenarios per second{left}.")
+        if self.pace:
+            lines.append(self.pace)
         lines += [f"Damaged: {name}" for name in self.damaged]
         again = f"jaxmpc study run {self.definition} --store {self.store}"
         if self.running:
@@ -105,14 +125,23 @@ def status(path: str | Path, verify: bool = False) -> StudyStatus:
         bytes=sum(length for group in files for length, _ in group.values()),
         damaged=tuple(found.damage),
         rate=computed / work if work > 0 else float("nan"),
+        seconds_left=_seconds_left(root.attrs, found),
         running=held(store),
         definition=str(root.attrs.get("definition_file", "STUDY.toml")),
     )
 
 
-def _duration(seconds: float) -> str:
-    """A time that a person reads."""
-    for unit, length in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
-        if seconds >= 2 * length:
-            return f"{seconds / length:.1f} {unit}"
-    return f"{seconds:.0f} s"
+def status_of(path: str | Path, study_hash: str) -> StudyStatus | None:
+    """The state of a store if it is there, undamaged in its fixed files, and of the study with this hash."""
+    try:
+        _, manifest = open_manifest(path)
+        return status(path) if manifest["study_hash"] == study_hash else None
+    except InputError:
+        return None
+
+
+def _seconds_left(attributes: Mapping[str, Any], found: Survey) -> float:
+    if "work" not in attributes:
+        return float("nan")
+    work = Work(**json.loads(attributes["work"]))
+    return work.rest({chunk: record["facts"] for chunk, record in found.records.items()})

@@ -1,0 +1,142 @@
+"""How long a sweep study takes: from one table before the first run, from the chunks themselves as soon as there are any.
+
+A dry run (`scenarios.Study.describe`) has only the table. The bar of a run and `study status` measure: chunks of a group
+have one shape and cost about the same, whereas groups differ by factors, so every group is judged by its own chunks.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+# The table: measured on 2 CPU cores with chunks of 64 scenarios and the thesis tuning. Smaller chunks are slower per
+# scenario, and tunings that move the choke readily take several times as long.
+SAMPLES_PER_SECOND = {"continuous": 4000.0, "mixed-integer": 800.0}  # samples of one scenario
+COMPILE_SECONDS = 20.0  # more for the first chunk of a group
+MODEL_SECONDS = 1.0  # identification of one model
+
+
+def chunk_seconds(kind: str, samples: int, lanes: int) -> float:
+    """What the table expects of one chunk without compilation [s].
+
+    Args:
+        kind: of the controller.
+        samples: length of the run.
+        lanes: scenarios of the compiled program, padding included.
+    """
+    return lanes * samples / SAMPLES_PER_SECOND[kind]
+
+
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """The chunks of a study and what the table expects of them.
+
+    Attributes:
+        groups: index of the group of every chunk.
+        kinds: kind of controller of every group.
+        seconds: `chunk_seconds` of every group [s].
+    """
+
+    groups: Sequence[int]
+    kinds: Sequence[str]
+    seconds: Sequence[float]
+
+    def costs(self, done: Mapping[int, Mapping[str, Any]]) -> list[float]:
+        """Seconds that one worker needs for a chunk of each group, without compilation.
+
+        A group with stored chunks has their mean, without the first one of every process, which compiled; where there
+        are no others, `COMPILE_SECONDS` are taken off it. A group without any has what the table expects, times measured
+        over expected of groups with its kind of controller (of all groups, where none of its kind is measured).
+
+        Args:
+            done: facts of stored chunks, as `chunk.ChunkResult` has them; those without ``wall_time`` were not computed.
+        """
+        times: dict[int, list[tuple[Any, float]]] = {}
+        for chunk in sorted(done):
+            facts = done[chunk]
+            if "wall_time" in facts:
+                process = facts.get("host"), facts.get("process")
+                times.setdefault(self.groups[chunk], []).append((process, float(facts["wall_time"])))
+        measured = {group: _mean(pairs, self.seconds[group]) for group, pairs in times.items()}
+        pace = {group: seconds / self.seconds[group] for group, seconds in measured.items()}
+        costs = []
+        for group, (kind, expected) in enumerate(zip(self.kinds, self.seconds, strict=True)):
+            alike = [value for other, value in pace.items() if self.kinds[other] == kind] or list(
+                pace.values()
+            )
+            factor = statistics.fmean(alike) if alike else 1.0
+            costs.append(measured.get(group, factor * expected))
+        return costs
+
+    def rest(self, done: Mapping[int, Mapping[str, Any]]) -> float:
+        """Seconds that one worker needs for all chunks that are not in `done`; groups without chunks compile first.
+
+        Args:
+            done: as for `costs`.
+        """
+        costs = self.costs(done)
+        missing = [group for chunk, group in enumerate(self.groups) if chunk not in done]
+        compiled = {self.groups[chunk] for chunk, facts in done.items() if "wall_time" in facts}
+        return sum(costs[group] for group in missing) + COMPILE_SECONDS * len(set(missing) - compiled)
+
+
+def _mean(pairs: Iterable[tuple[Any, float]], expected: float) -> float:
+    """Mean time of chunks without compilation."""
+    seen, later, every = set(), [], []
+    for process, seconds in pairs:
+        every.append(seconds)
+        if process in seen:
+            later.append(seconds)
+        seen.add(process)
+    if later:
+        return statistics.fmean(later)
+    mean = statistics.fmean(every)
+    return min(mean, max(mean - COMPILE_SECONDS, expected))
+
+
+class Pace:
+    """The time left of a run, from the chunks that it has computed and from the time that has passed meanwhile.
+
+    With several workers, chunks overlap: the rest of the work is divided by what was computed per second that passed.
+    """
+
+    def __init__(
+        self, work: Work, done: Mapping[int, Mapping[str, Any]], clock: Callable[[], float] = time.monotonic
+    ):
+        """Start the clock.
+
+        Args:
+            work: of the study.
+            done: facts of the chunks that are stored already.
+            clock: seconds that pass.
+        """
+        self._work, self._done, self._clock = work, dict(done), clock
+        self._begin, self._computed = clock(), 0.0
+
+    def add(self, chunk: int, facts: Mapping[str, Any]) -> None:
+        """A chunk has arrived."""
+        self._done[chunk] = facts
+        self._computed += float(facts["wall_time"])
+
+    @property
+    def left(self) -> float:
+        """Time left [s]; NaN before the first chunk has arrived."""
+        if not self._computed:
+            return float("nan")
+        return self._work.rest(self._done) * (self._clock() - self._begin) / self._computed
+
+
+def megabytes(size: float) -> str:
+    """A size [B] that a person reads."""
+    return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{size / 1e6:.2g} MB"
+
+
+def readable(seconds: float) -> str:
+    """A time that a person reads."""
+    for unit, length in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.1f} {unit}"
+    return f"{seconds:.0f} s"
