@@ -44,7 +44,20 @@ def _(explore, mo, presets):
     blocking = mo.ui.dropdown(list(explore.BLOCKING), value="moves")
     length = mo.ui.dropdown({"30 min": False, "22 h": True}, value="30 min")
     soft = mo.ui.switch(value=True, label="Soft MPC")
-    return blocking, controller, length, preset, soft
+    # Shown by the cell that makes them, as all controls are: a cell that only lays them out would run, and draw every
+    # one of them again, whenever one is moved.
+    choices_panel = mo.vstack(
+        [
+            mo.Html(
+                '<div style="display:grid;grid-template-columns:auto 1fr;gap:0 1rem;align-items:center;'
+                f'font-size:0.9rem"><span>controller</span>{controller}<span>preset</span>{preset}'
+                f"<span>blocking</span>{blocking}<span>length</span>{length}</div>"
+            ),
+            soft,
+        ],
+        gap=0.4,
+    )
+    return blocking, choices_panel, controller, length, preset, soft
 
 
 @app.cell
@@ -71,11 +84,12 @@ def _(RATIOS, mo, preset, presets):
     gas_deadzone = _slider(
         "gas deadzone", _fields["deadzone"]["gas_rate"], "m³/h", [100.0 * k for k in range(31)]
     )
-    return choke_weight, gas_deadzone, gas_weight, oil_deadzone, oil_weight
+    tuning_panel = mo.vstack([choke_weight, oil_deadzone, gas_deadzone, oil_weight, gas_weight], gap=0.4)
+    return choke_weight, gas_deadzone, gas_weight, oil_deadzone, oil_weight, tuning_panel
 
 
 @app.cell
-def _(mo):
+def _(explore, mo):
     def _slider(start, stop, step, value, label):
         return mo.ui.slider(
             start, stop, step, value=value, label=label, show_value=True, debounce=True, full_width=True
@@ -87,53 +101,29 @@ def _(mo):
     pressure_time = _slider(0, 1790, 10, 900, "from [s]")
     model_choke = _slider(6, 96, 2, 50, "model: choke [%]")
     model_lift = _slider(2500, 9500, 250, 7500, "model: lift [m³/h]")
-    return gas_setpoint, model_choke, model_lift, oil_setpoint, pressure, pressure_time
+    setpoint_panel = mo.vstack(
+        [mo.md(f"**Setpoints** from {explore.STEP_TIME:g} s"), oil_setpoint, gas_setpoint], gap=0.4
+    )
+    model_panel = mo.accordion(
+        {"Disturbance and model": mo.vstack([pressure, pressure_time, model_choke, model_lift], gap=0.4)}
+    )
+    return (
+        gas_setpoint,
+        model_choke,
+        model_lift,
+        model_panel,
+        oil_setpoint,
+        pressure,
+        pressure_time,
+        setpoint_panel,
+    )
 
 
 @app.cell
-def _(
-    blocking,
-    choke_weight,
-    controller,
-    explore,
-    gas_deadzone,
-    gas_setpoint,
-    gas_weight,
-    length,
-    mo,
-    model_choke,
-    model_lift,
-    oil_deadzone,
-    oil_setpoint,
-    oil_weight,
-    page,
-    preset,
-    pressure,
-    pressure_time,
-    soft,
-):
-    _tuning = [soft, choke_weight, oil_deadzone, gas_deadzone, oil_weight, gas_weight]
-    _step = (
-        []
-        if length.value
-        else [mo.md(f"**Setpoints** from {explore.STEP_TIME:g} s"), oil_setpoint, gas_setpoint]
-    )
-    _shown = [
-        mo.Html(
-            '<div style="display:grid;grid-template-columns:auto 1fr;gap:0 1rem;align-items:center;font-size:0.9rem">'
-            f"<span>controller</span>{controller}<span>preset</span>{preset}"
-            f"<span>blocking</span>{blocking}<span>length</span>{length}</div>"
-        ),
-        *_tuning,
-        *_step,
-        mo.accordion(
-            {"Disturbance and model": mo.vstack([pressure, pressure_time, model_choke, model_lift], gap=0.4)}
-        ),
-    ]
-    mo.sidebar(
-        [mo.vstack([page, *(_shown if page.value == "Run a loop" else [])], gap=0.4)],
-        width="330px",
-    )
+def _(choices_panel, length, mo, model_panel, page, setpoint_panel, tuning_panel):
+    _step = [] if length.value else [setpoint_panel]
+    _shown = [choices_panel, tuning_panel, *_step, model_panel] if page.value == "Run a loop" else []
+    mo.sidebar([mo.vstack([page, *_shown], gap=0.4)], width="330px")
     return
 
 
