@@ -23,7 +23,7 @@ from jaxmpc.threads import parts_of, side_by_side
 from jaxmpc.trajectory import RECORDABLE
 
 CHUNK = 300  # samples between two progress reports of a compiled loop
-SIDE_BY_SIDE = 64  # lanes of one compiled call, on a CPU
+SIDE_BY_SIDE = 16  # lanes of one compiled call, on a CPU
 
 
 def record_of(cv, mv, state: ControllerState, info: StepInfo) -> dict[str, Any]:

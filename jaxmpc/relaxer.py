@@ -243,8 +243,15 @@ class Relaxer:
         return self.of_decision.unpack(found)
 
     def compile(self, instances: QpInstance, warm: WarmStart) -> None:
-        """Compile what searches call: single problems and small batches, and large ones where there are many scenarios."""
+        """Compile what nearly every search calls: the compiled search, or relaxations in batches of a few sizes."""
         lower, upper = np.asarray(instances.lower), np.asarray(instances.upper)
+        if self.tables is not None:
+            blank = jax.tree.map(lambda v: np.zeros((len(lower), *v.shape[1:]), v.dtype), self.solved_shapes)
+            roots = relaxations(blank._replace(bound=np.full(len(lower), np.nan)), self.predictions)
+            for size in self.sizes:
+                self.decide(instances, np.zeros(size, dtype=int), roots, 1e-6)
+                if size >= len(lower):
+                    return
         for size in [s for s in self.sizes if s <= max(SIZES[1], len(lower))]:
             index = np.zeros(size, dtype=int)
             start = jax.tree.map(lambda leaf, i=index: np.asarray(leaf)[i], warm)
