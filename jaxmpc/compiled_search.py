@@ -23,7 +23,7 @@ from jaxmpc.blocking import first_position_rows, moves_per_block, oscillation_ro
 from jaxmpc.condense import CondensedQp, QpInstance, integer_columns
 from jaxmpc.constants import Constants
 from jaxmpc.levelset import assignment_order
-from jaxmpc.relaxation import Solved, relax
+from jaxmpc.relaxation import Solved, map_singly, relax
 from jaxmpc.status import finisher_code
 from jaxmpc.structure import Structure
 
@@ -198,37 +198,27 @@ def decide(
 
 @functools.lru_cache(maxsize=64)
 def _decide(structure: Structure):
-    """`_decide_lane`, whose batches a CPU searches one by one."""
-    lane = functools.partial(_decide_lane, structure)
+    """`decide_lane`, whose batches a CPU searches one by one."""
+    lane = functools.partial(decide_lane, structure)
     search = jax.custom_batching.custom_vmap(lane)
 
     @search.def_vmap
     def _(size: int, batched, *arguments):
-        leaves, form = jax.tree.flatten(arguments)
-        mine = jax.tree.leaves(tuple(batched))
-
-        def one_by_one(*leaves):
-            def one(own):
-                own = iter(own)
-                return lane(
-                    *form.unflatten([next(own) if its else v for v, its in zip(leaves, mine, strict=True)])
-                )
-
-            return jax.lax.map(one, [v for v, its in zip(leaves, mine, strict=True) if its])
-
-        def together(*leaves):
-            axes = form.unflatten([0 if its else None for its in mine])
-            return jax.vmap(lane, in_axes=axes, axis_size=size)(*form.unflatten(leaves))
-
-        result = jax.lax.platform_dependent(*leaves, cpu=one_by_one, default=together)
+        own = tuple(batched)
+        if jax.default_backend() == "cpu":
+            result = map_singly(lane, arguments, own)
+        else:
+            axes = jax.tree.map(lambda its: 0 if its else None, own)
+            result = jax.vmap(lane, in_axes=axes, axis_size=size)(*arguments)
         return result, jax.tree.map(lambda _: True, result)
 
     return search
 
 
-def _decide_lane(
+def decide_lane(
     structure: Structure, qp: CondensedQp, tables: Tables, rows, instance, root: Solved, gap
 ) -> Decision:
+    """`decide` for one lane; under `jax.vmap`, all lanes go in lockstep."""
     order = _order_of(structure)
     columns = order.columns
     predictions = instance.limit_high.shape[0]
@@ -449,12 +439,12 @@ def _grid_below(order: _Order, tables: Tables, limits: _Rows, model: _Lower, siz
 def _list_below(order: _Order, tables: Tables, limits: _Rows, model: _Lower, cutoff) -> _Listed:
     """Breadth-first search, move by move; `BLOCK` partial assignments at a time get their next move."""
     moves, room = len(order.columns), LONGEST + 3 * BLOCK
-    reach, previous = jnp.asarray(order.reach), jnp.asarray(order.previous)
+    reach, previous, leading = (jnp.asarray(v) for v in (order.reach, order.previous, tables.leading))
 
     def assign(carry):
         i, codes, bounds, count = carry
         now, then = i % 2, (i + 1) % 2
-        row = tables.leading[i]
+        row = leading[i]
         shift = row @ model.center
         pick = jnp.stack([row, reach[i], previous[i]], axis=1)  # of the moves before, this one still zero
         step, place = row[i] * STEPS - shift, reach[i, i] * STEPS

@@ -57,7 +57,8 @@ def gram(
     after = jnp.pad(by_cv[:, 1:], ((0, 0), (0, 1)))
     # a compiler that fuses products with the difference would leave rounding where nothing changes
     changes = jnp.where(by_cv != after, by_cv - after, 0.0).reshape(-1)
-    return jax.lax.platform_dependent(response, summed, changes, sharp, cpu=one_by_one, default=at_once)
+    way = one_by_one if jax.default_backend() == "cpu" else at_once
+    return way(response, summed, changes, sharp)
 
 
 def _dense(response, weights):

@@ -179,22 +179,26 @@ class _Progress(NamedTuple):
 def _solve_batch(size: int, given, own, start: WarmStart, own_start) -> QpSolution:
     """Many lanes; `own` and `own_start` are True for arrays with a batch axis."""
     given, own = _with_sums(given, own)
-    one_by_one = lambda given, start: solve_singly(given, own, start, own_start)  # noqa: E731
-    together = lambda given, start: solve_together(size, given, own, start, own_start)  # noqa: E731
-    return jax.lax.platform_dependent(given, start, cpu=one_by_one, default=together)
+    if jax.default_backend() == "cpu":
+        return solve_singly(given, own, start, own_start)
+    return solve_together(size, given, own, start, own_start)
 
 
 def solve_singly(given, own, start: WarmStart, own_start) -> QpSolution:
     """A batch, one lane after the other; arguments as in `solve_together`."""
-    leaves, form = jax.tree.flatten((given, start))
-    mine = jax.tree.leaves((own, own_start))
+    return map_singly(lambda given, start: _solve_lane(given, start, None), (given, start), (own, own_start))
+
+
+def map_singly(function, arguments, own):
+    """The function over the arrays of its arguments that have a batch axis, one lane after the other."""
+    leaves, form = jax.tree.flatten(arguments)
+    mine = jax.tree.leaves(own)
 
     def lane(some):
         some = iter(some)
-        given, start = jax.tree.unflatten(
-            form, [next(some) if its else v for v, its in zip(leaves, mine, strict=True)]
+        return function(
+            *form.unflatten([next(some) if its else v for v, its in zip(leaves, mine, strict=True)])
         )
-        return _solve_lane(given, start, None)
 
     return jax.lax.map(lane, [v for v, its in zip(leaves, mine, strict=True) if its])
 

@@ -234,3 +234,26 @@ def test_a_list_that_does_not_fit_is_not_claimed_to_be_done(small_structure, pro
         found = searched(small_structure, problem)
         if found.closed:
             assert float(found.value) == pytest.approx(problem[3].min(), rel=1e-6, abs=1e-9)
+
+
+def test_a_batch_of_compiled_searches_in_lockstep_is_each_alone(small_structure, problems):
+    """What an accelerator runs for scenarios of one controller."""
+    constants = problems[0][0]
+    relaxer = Relaxer([constants])
+    instances = jax.tree.map(lambda *leaves: np.stack(leaves), *[problem[1] for problem in problems])
+    cold = jax.tree.map(lambda leaf: np.repeat(leaf[None], len(problems), axis=0), constants.cold)
+    roots = relaxer.solve_roots(instances, cold).solved
+
+    def lane(instance, root):
+        tables = Tables.of(constants)
+        return compiled_search.decide_lane(
+            small_structure, constants.qp, tables, relaxer.rows, instance, root, 1e-6
+        )
+
+    together = jax.jit(jax.vmap(lane))(instances, roots)
+    for k, problem in enumerate(problems):
+        alone = searched(small_structure, problem)
+        assert bool(together.closed[k]) == bool(alone.closed)
+        if alone.closed:
+            np.testing.assert_allclose(together.value[k], alone.value, rtol=1e-6)
+            assert int(together.finished_by[k]) == int(alone.finished_by)

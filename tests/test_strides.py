@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from identify.step_test import identify_step_response
-from jaxmpc import closed_loop, status
-from jaxmpc.closed_loop import simulate
-from jaxmpc.mixed_integer import MixedIntegerController
+from jaxmpc import closed_loop, status, strides
+from jaxmpc.closed_loop import simulate, simulate_batch
+from jaxmpc.mixed_integer import MixedIntegerController, MixedIntegerControllers
 from jaxmpc.plant import WellPlant
 from jaxmpc.reference import Reference
 from jaxmpc.trajectory import RECORDABLE
@@ -38,7 +38,7 @@ def both(monkeypatch, made, **options):
 @pytest.mark.parametrize("blocking", ["moves", "inputs"])
 def test_strides_give_the_run_of_single_steps(monkeypatch, model, blocking):
     disturbance = np.where(np.arange(SAMPLES) > 40, -3.0, 0.0)
-    strides, steps = both(
+    run, steps = both(
         monkeypatch,
         controller(model, blocking),
         disturbance=disturbance,
@@ -48,7 +48,7 @@ def test_strides_give_the_run_of_single_steps(monkeypatch, model, blocking):
     assert set(np.unique(steps.finished_by)) >= {status.finisher_code("relaxation")}
     assert (steps.finished_by != status.finisher_code("relaxation")).any(), "no sample was searched"
     for field in (*RECORDABLE, "plan"):
-        one, other = getattr(strides, field), getattr(steps, field)
+        one, other = getattr(run, field), getattr(steps, field)
         if field in ("status", "fallback", "nodes", "finished_by"):
             np.testing.assert_array_equal(one, other, err_msg=field)
         elif field == "gap":
@@ -56,8 +56,8 @@ def test_strides_give_the_run_of_single_steps(monkeypatch, model, blocking):
         elif field != "solve_time":
             # sums of some hundred terms are rounded in another order, and the loop feeds that back
             np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-8, err_msg=field)
-    np.testing.assert_array_equal(strides.mv_demand[:, 0], steps.mv_demand[:, 0])
-    assert (strides.solve_time > 0).all()
+    np.testing.assert_array_equal(run.mv_demand[:, 0], steps.mv_demand[:, 0])
+    assert (run.solve_time > 0).all()
 
 
 def test_progress_counts_every_sample_once(model):
@@ -82,3 +82,45 @@ def test_a_controller_whose_finish_is_prescribed_is_stepped(monkeypatch, model):
     monkeypatch.setattr(closed_loop, "simulate_in_strides", refuse)
     run = simulate(controller(model, finish="branch-and-bound"), PLANT, REFERENCE, samples=3)
     assert (run.status == status.OPTIMAL).all()
+
+
+def test_many_loops_do_not_depend_on_how_many_threads_and_parts_there_are(monkeypatch, model):
+    """Three parts of two, the last filled up, by one thread and by three; and each loop alone."""
+    structure = presets.structure("moves", integer=True)
+    weights = [150.0, 600.0, 300.0, 2000.0, 80.0]
+    tunings = [
+        presets.tuning(structure, changes={"move_weight": {"choke": w, "gas_lift": 0.2}}) for w in weights
+    ]
+    monkeypatch.setattr(strides, "TOGETHER", 2)
+    runs, seen = {}, []
+    for threads in ("1", "3"):
+        monkeypatch.setenv("JAXMPC_THREADS", threads)
+        controllers = MixedIntegerControllers(structure, tunings, [model])
+        progress = lambda done, total: seen.append((done, total))  # noqa: E731
+        runs[threads] = simulate_batch(controllers, PLANT, REFERENCE, samples=60, progress=progress)
+        assert seen[-1] == (5 * 60, 5 * 60)
+        assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+        seen.clear()
+    for tuning, one, three in zip(tunings, runs["1"], runs["3"], strict=True):
+        for field in RECORDABLE:
+            if field != "solve_time":
+                np.testing.assert_array_equal(getattr(one, field), getattr(three, field), err_msg=field)
+        alone = simulate(MixedIntegerController(structure, tuning, model), PLANT, REFERENCE, samples=60)
+        np.testing.assert_array_equal(alone.mv_demand[:, 0], one.mv_demand[:, 0])
+        # sums are rounded in another order, and the loop feeds that back
+        np.testing.assert_allclose(alone.cv, one.cv, rtol=1e-8)
+        assert (one.solve_time > 0).all()
+
+
+def test_what_one_thread_raises_ends_all(monkeypatch, model):
+    monkeypatch.setattr(strides, "TOGETHER", 1)
+    monkeypatch.setenv("JAXMPC_THREADS", "2")
+    structure = presets.structure("moves", integer=True)
+    controllers = MixedIntegerControllers(structure, [presets.tuning(structure)], [model], count=2)
+
+    def interrupt(done, total):
+        if done > 10:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate_batch(controllers, PLANT, REFERENCE, progress=interrupt)
