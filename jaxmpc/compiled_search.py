@@ -196,17 +196,38 @@ def decide(
     return _decide(structure)(qp, tables, jnp.asarray(rows), instance, root, jnp.asarray(gap, dtype=float))
 
 
+def closes(root: Solved, scale, gap) -> Bool[Array, ""]:
+    """Whether the rounded moves of a relaxation are proven by its own bound.
+
+    Args:
+        root: the relaxation.
+        scale: smallest value that gaps are relative to.
+        gap: relative gap.
+    """
+    bound = jnp.maximum(root.bound, 0.0)
+    size = jnp.maximum(jnp.abs(root.snapped), scale)
+    return jnp.isfinite(root.snapped) & (root.snapped - bound <= gap * size)
+
+
 @functools.lru_cache(maxsize=64)
 def _decide(structure: Structure):
     """`decide_lane`, whose batches a CPU searches one by one."""
     lane = functools.partial(decide_lane, structure)
+
+    def where_open(*arguments) -> Decision:
+        """A search takes as long to set up as a relaxation: none without a root."""
+        root: Solved = arguments[-2]
+        none, zero = jnp.zeros(()), jnp.zeros((), dtype=int)
+        nothing = Decision(jnp.asarray(False), jnp.zeros_like(root.warm.x), none, none, zero, zero + 1, zero)
+        return jax.lax.cond(jnp.isfinite(root.bound), lambda: lane(*arguments), lambda: nothing)
+
     search = jax.custom_batching.custom_vmap(lane)
 
     @search.def_vmap
     def _(size: int, batched, *arguments):
         own = tuple(batched)
         if jax.default_backend() == "cpu":
-            result = map_singly(lane, arguments, own)
+            result = map_singly(where_open, arguments, own)
         else:
             axes = jax.tree.map(lambda its: 0 if its else None, own)
             result = jax.vmap(lane, in_axes=axes, axis_size=size)(*arguments)

@@ -118,13 +118,7 @@ def solve_integers(
             results[i] = _closed_by_root(relaxer, root, i, bound, seconds / count)
             continue
         waiting.append(i)
-    quick = (
-        finish == "auto"
-        and not searched
-        and (time_limit is None or time_limit >= UNINTERRUPTED)
-        and relaxer.tables is not None
-    )
-    if waiting and quick:
+    if waiting and not searched and compiles(relaxer, finish, time_limit):
         _decided_at_once(relaxer, instances, np.asarray(waiting), root, gap, seconds / count, results)
     for i in [i for i in waiting if results[i] is None]:
         own = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], instances)
@@ -137,6 +131,12 @@ def solve_integers(
             result.seconds = search.spent
             results[i] = result
     return [result for result in results if result is not None], root
+
+
+def compiles(relaxer: Relaxer, finish: str, time_limit: float | None) -> bool:
+    """Whether searches may run in one compiled call, which nothing interrupts."""
+    unhurried = time_limit is None or time_limit >= UNINTERRUPTED
+    return finish == "auto" and unhurried and relaxer.tables is not None
 
 
 def _decided_at_once(

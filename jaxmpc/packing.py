@@ -1,7 +1,8 @@
 """Many small arrays as one: what passes between host and device at every sample goes in one piece.
 
 A compiled call costs some microseconds for every array that goes in or comes out, which adds up to more than the arithmetic
-of a sample. `relaxer` and `mixed_integer` pack what they exchange; on the host the parts are views, nothing is copied.
+of a sample. What changes from sample to sample is packed (`Packing`); on the host its parts are views, nothing is copied.
+What stays is taken apart only once (`flattened`), as a module of arrays would be at every call.
 """
 
 from __future__ import annotations
@@ -10,9 +11,12 @@ import dataclasses
 import math
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+FLOAT = np.dtype(float)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,13 +31,13 @@ class Packing:
 
     form: Any
     shapes: tuple[tuple[int, ...], ...]
-    kinds: tuple[str, ...]
+    kinds: tuple[np.dtype, ...]
 
     @classmethod
     def of(cls, tree: Any) -> Packing:
         """The packing of a tree whose arrays (or shapes) have a lane axis first."""
         leaves, form = jax.tree.flatten(tree)
-        return cls(form, tuple(tuple(v.shape[1:]) for v in leaves), tuple(str(v.dtype) for v in leaves))
+        return cls(form, tuple(tuple(v.shape[1:]) for v in leaves), tuple(v.dtype for v in leaves))
 
     def pack(self, tree: Any):
         """One array ``"lane entry"`` of floats, NumPy's if all parts are."""
@@ -47,6 +51,18 @@ class Packing:
         for shape, kind in zip(self.shapes, self.kinds, strict=True):
             end = begin + math.prod(shape)
             part = packed[:, begin:end].reshape(packed.shape[0], *shape)
-            parts.append(part if kind == "float64" else part.astype(kind))
+            parts.append(part if kind == FLOAT else part.astype(kind))
             begin = end
         return self.form.unflatten(parts)
+
+
+def flattened(tree: Any) -> tuple[list[jax.Array], Any]:
+    """The arrays of a tree, and its form, which is hashable if all else in the tree is."""
+    arrays, rest = eqx.partition(tree, eqx.is_array_like)
+    return [jnp.asarray(leaf) for leaf in jax.tree.leaves(arrays)], (jax.tree.structure(arrays), rest)
+
+
+def rebuilt(form: Any, leaves: Any) -> Any:
+    """The tree again; see `flattened`."""
+    structure, rest = form
+    return eqx.combine(jax.tree.unflatten(structure, leaves), rest)

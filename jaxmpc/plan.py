@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
+from typing import Any
 
 import jax
 import numpy as np
@@ -21,7 +22,9 @@ from jaxmpc.constants import Constants
 from jaxmpc.errors import InputError
 from jaxmpc.integer import FINISHES, continuous_feasible
 from jaxmpc.newton import WarmStart
-from jaxmpc.relaxer import Relaxer
+from jaxmpc.packing import Packing, flattened, rebuilt
+from jaxmpc.relaxation import relax
+from jaxmpc.relaxer import Relaxations, Relaxer, relaxations
 from jaxmpc.search import SearchResult
 from jaxmpc.step_response import StepResponseModel, check_match
 from jaxmpc.step_solver import StepSolver
@@ -84,6 +87,17 @@ def _make_instance(structure, tuning, qp, free_response, setpoint, mv_now, last_
     return jax.tree.map(lambda leaf: leaf[None], instance)
 
 
+@functools.partial(jax.jit, static_argnames=("structure", "recover", "form", "packings"))
+def _relax_instance(structure, leaves, given, recover, form, packings):
+    """`_make_instance` and its relaxation; goes in and comes out packed."""
+    tuning, qp, rows, columns = rebuilt(form, leaves)
+    *sample, start = jax.tree.map(lambda leaf: leaf[0], packings[0].unpack(given))
+    instances = _make_instance(structure, tuning, qp, *sample, recover)
+    own = jax.tree.map(lambda leaf: leaf[0], instances)
+    root = relax(qp, rows, columns, own, own.lower, own.upper, start)
+    return packings[1].pack((instances, jax.tree.map(lambda leaf: leaf[None], root)))
+
+
 class Planner:
     """Solves the steps of one controller.
 
@@ -96,9 +110,11 @@ class Planner:
     def __init__(self, structure: Structure, tuning: Tuning, model: StepResponseModel):
         check_match(structure, model)
         self.structure, self.tuning, self.model = structure, tuning, model
+        self._numbers = jax.tree.map(np.asarray, tuning)
         self.matrix = np.asarray(dynamic_matrix(structure, model.coefficients))
         self.solver = StepSolver(structure, [tuning], [model])
-        self._started = False
+        self._packings: dict[tuple[bool, Packing], tuple[Packing, Packing]] = {}
+        self._flat: Any = None
 
     def solve(
         self,
@@ -135,29 +151,25 @@ class Planner:
         as_array = lambda v: np.asarray(v, dtype=np.float64)  # noqa: E731
         free_response, setpoint, mv_now = as_array(free_response), as_array(setpoint), as_array(mv_now)
         past = None if past_moves is None else as_array(past_moves)
+        sample = free_response, setpoint, mv_now, as_array(last_move), past
+        relaxer, root = self.solver.relaxer(1), None
 
         def instances_of(relaxer: Relaxer) -> QpInstance:
-            return _make_instance(
-                self.structure,
-                self.tuning,
-                relaxer.scenario(0).qp,
-                free_response,
-                setpoint,
-                mv_now,
-                as_array(last_move),
-                past,
-                recover,
-            )
+            if root is not None:
+                return instances
+            return _make_instance(self.structure, self.tuning, relaxer.scenario(0).qp, *sample, recover)
 
-        if not self._started:  # compiles; the clock measures solves
-            jax.block_until_ready(instances_of(self.solver.relaxer(1)))
-            self._started = True
-        begin = time.perf_counter() - self.solver.compiling
         start = None if warm is None else jax.tree.map(lambda leaf: np.asarray(leaf)[None], warm)
-        if self.structure.integer_mvs:
+        if self.solver.narrow:
+            begin, instances, root = self._posed(relaxer, sample, recover, relaxer.fitting(start, 1))
+        else:
+            jax.block_until_ready(instances_of(relaxer))  # compiles; the clock measures solves
+            begin = time.perf_counter() - self.solver.compiling
+        if root is None or self.structure.integer_mvs:
             previous = None if previous_moves is None else as_array(previous_moves)[None]
             relaxer, instances, results, _ = self.solver.solve(
                 instances_of,
+                root=root,
                 previous_moves=previous,
                 warm=start,
                 gap=gap,
@@ -166,19 +178,41 @@ class Planner:
             )
             result = results[0]
         else:
-            relaxer = self.solver.relaxer(1)
-            instances = instances_of(relaxer)
-            result = self._solve_relaxed(relaxer, instances, relaxer.fitting(start, 1), gap)
+            result = self._solve_relaxed(relaxer, instances, root, gap)
         instance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], instances)
         return self._plan(relaxer.scenario(0), instance, result, mv_now, free_response, setpoint, gap, begin)
 
+    def _posed(
+        self, relaxer: Relaxer, sample: tuple, recover: bool, start: WarmStart
+    ) -> tuple[float, QpInstance, Relaxations]:
+        """When the clock started, the problem for moves of one step, and its relaxation."""
+        given = (*(None if v is None else v[None] for v in sample), start)
+        of_given = Packing.of(given)
+        if self._flat is None:
+            qp = relaxer.scenario(0).qp
+            self._flat = flattened((self.tuning, qp, relaxer.hard, relaxer.columns))
+        leaves, form = self._flat
+        fresh = (recover, of_given) not in self._packings
+        if fresh:
+            qp = relaxer.scenario(0).qp
+            shapes = jax.eval_shape(lambda: _make_instance(self.structure, self.tuning, qp, *sample, recover))
+            self._packings[recover, of_given] = of_given, Packing.of((shapes, relaxer.solved_shapes))
+        packings = self._packings[recover, of_given]
+        call = lambda: np.asarray(  # noqa: E731
+            _relax_instance(self.structure, leaves, of_given.pack(given), recover, form, packings)
+        )
+        if fresh:
+            call()  # compiles; the clock measures solves
+        begin = time.perf_counter() - self.solver.compiling
+        instances, root = packings[1].unpack(call())
+        return begin, instances, relaxations(root, relaxer.predictions)
+
     def _solve_relaxed(
-        self, relaxer: Relaxer, instances: QpInstance, start: WarmStart, gap: float
+        self, relaxer: Relaxer, instances: QpInstance, root: Relaxations, gap: float
     ) -> SearchResult:
         """The problem without integers: one relaxation."""
         if not continuous_feasible(self.structure, jax.tree.map(lambda leaf: np.asarray(leaf)[0], instances)):
             return SearchResult(None, np.inf, np.inf, codes.INFEASIBLE, None, 0)
-        root = relaxer.solve_roots(instances, start)
         if not np.isfinite(root.x[0]).all():
             return SearchResult(None, np.inf, -np.inf, codes.FAILED, None, 1)
         value = float(root.objective[0])
@@ -243,19 +277,19 @@ class Planner:
         Returns:
             ``(objective, cv, (eps_high, eps_low))``.
         """
-        tuning = self.tuning
-        cv = free_response + np.einsum("cjmb,bm->jc", self.matrix, moves)
+        tuning = self._numbers
+        cv = free_response + np.tensordot(self.matrix, moves, ((3, 2), (0, 1))).T
         first = self.structure.first_penalised - 1
         y, deviation = cv[first:], cv[first:] - setpoint[first:]
-        beyond = np.maximum(np.abs(deviation) - np.asarray(tuning.deadzone), 0.0)
-        eps_high = np.maximum((y - np.asarray(tuning.cv_high)).max(axis=0), 0.0)
-        eps_low = np.maximum((np.asarray(tuning.cv_low) - y).max(axis=0), 0.0)
+        beyond = np.maximum(np.abs(deviation) - tuning.deadzone, 0.0)
+        eps_high = np.maximum((y - tuning.cv_high).max(axis=0), 0.0)
+        eps_low = np.maximum((tuning.cv_low - y).max(axis=0), 0.0)
         counts = moves_per_block(self.structure)[:, None]
         value = (
-            (np.asarray(tuning.cv_weight) * deviation**2).sum()
-            + (np.asarray(tuning.move_weight) * counts * moves**2).sum()
-            + (np.asarray(tuning.soft_quadratic) * beyond**2 + np.asarray(tuning.soft_linear) * beyond).sum()
-            + (np.asarray(tuning.slack_weight) * (eps_high + eps_low)).sum()
+            (tuning.cv_weight * deviation**2).sum()
+            + (tuning.move_weight * counts * moves**2).sum()
+            + (tuning.soft_quadratic * beyond**2 + tuning.soft_linear * beyond).sum()
+            + (tuning.slack_weight * (eps_high + eps_low)).sum()
         )
         return float(value), cv, (eps_high, eps_low)
 

@@ -21,12 +21,12 @@ from jaxtyping import Array, Bool, Float
 
 from jaxmpc import status as codes
 from jaxmpc.batch import Lanes
-from jaxmpc.compiled_search import decide
+from jaxmpc.compiled_search import closes, decide
 from jaxmpc.condense import QpInstance, integer_columns
 from jaxmpc.controller import ControllerState
-from jaxmpc.integer import UNINTERRUPTED, solve_integers
+from jaxmpc.integer import compiles, solve_integers
 from jaxmpc.mixed_integer import MixedIntegerControllers, observed, relative_gap, remembered
-from jaxmpc.packing import Packing
+from jaxmpc.packing import Packing, flattened, rebuilt
 from jaxmpc.plant import WellPlant, WellState
 from jaxmpc.relaxation import Solved
 from jaxmpc.relaxer import relaxations
@@ -97,11 +97,9 @@ class Loop(NamedTuple):
 
 def able(controllers: MixedIntegerControllers) -> bool:
     """Whether samples can be closed on the device: moves of one step, no way to finish prescribed, no short time limit."""
-    plain = type(controllers) is MixedIntegerControllers and controllers.finish == "auto"
-    unhurried = controllers.time_limit is None or controllers.time_limit >= UNINTERRUPTED
-    return (
-        plain and unhurried and controllers.solver.narrow and controllers.solver.relaxer(1).tables is not None
-    )
+    c = controllers
+    plain = type(c) is MixedIntegerControllers and c.solver.narrow
+    return plain and compiles(c.solver.relaxer(1), c.finish, c.time_limit)
 
 
 def simulate_in_strides(
@@ -205,11 +203,9 @@ class _Run:
         self.narrow = controllers.solver.relaxer(1)
         assert self.narrow.tables is not None
         memory, (qps, rows, _) = controllers.memory, controllers.constants
-        loop = Loop(memory, qps, self.narrow.tables, rows, controllers.scales_of(self.narrow)[0], plants)
-        # flat, as taking the modules apart at every call takes longer than a sample
-        arrays, rest = eqx.partition(loop, eqx.is_array_like)
-        self.leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(arrays)]
-        self.form = jax.tree.structure(arrays), rest
+        self.leaves, self.form = flattened(
+            Loop(memory, qps, self.narrow.tables, rows, controllers.scales_of(self.narrow)[0], plants)
+        )
         scale = controllers.scales_of(self.narrow)[1]
         self.gaps = np.stack([np.full(self.count, max(controllers.gap, 1e-9)), 1e-6 * scale], axis=1)
 
@@ -322,8 +318,7 @@ def _programs(statics: _Statics):
 
 
 def _loop(statics: _Statics, leaves) -> Loop:
-    form, rest = statics.form
-    return eqx.combine(jax.tree.unflatten(form, leaves), rest)
+    return rebuilt(statics.form, leaves)
 
 
 def _decided(structure: Structure, loop: Loop, instance, root: Solved, gaps):
@@ -382,13 +377,12 @@ def _stride(statics: _Statics, leaves, packed, inputs, gaps):
             loop.memory, loop.qps, loop.rows, columns, sample.state, sample.cv, setpoints[:, at + 1]
         )
         assert root is not None
-        bound = jnp.maximum(root.bound, 0.0)
-        size = jnp.maximum(jnp.abs(root.snapped), gaps[:, 1])
         known = jnp.isfinite(sample.cv).all(axis=1)
-        closed = known & jnp.isfinite(root.snapped) & (root.snapped - bound <= gaps[:, 0] * size)
+        closed = known & closes(root, gaps[:, 1], gaps[:, 0])
         x = root.warm.x
         x = x.at[:, columns].set(jnp.round(x[:, columns]))
-        value, bound, steps = root.snapped, jnp.minimum(bound, root.snapped), root.steps.astype(int)
+        value, steps = root.snapped, root.steps.astype(int)
+        bound = jnp.minimum(jnp.maximum(root.bound, 0.0), value)
         nodes, finished_by = jnp.ones_like(steps), jnp.full_like(steps, RELAXATION)
         if statics.inside:
             open_root = root._replace(bound=jnp.where(closed | ~known, jnp.nan, root.bound))

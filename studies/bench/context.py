@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
@@ -144,16 +148,36 @@ def ask(
     seconds, answers, plans = [], [], []
     for case in cases:
         form = peer.build(case)
-        if peer.keeps and not answers:
-            solve(form)  # sets up what is set up once
         taken: list[float] = []
-        while not taken or (len(taken) < REPEATS and taken[0] < LONG):
-            answer = solve(form)
-            taken.append(answer.seconds)
+        with _silence():
+            if peer.keeps and not answers:
+                solve(form)  # sets up what is set up once
+            while not taken or (len(taken) < REPEATS and taken[0] < LONG):
+                answer = solve(form)
+                taken.append(answer.seconds)
         seconds.append(float(np.median(taken)))
         answers.append(answer)
         plans.append(None if answer.z is None else form.moves(answer.z))
     return np.array(seconds), answers, plans
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Drop what solvers print past Python, whatever they were told."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept = [os.dup(number) for number in (1, 2)]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for number in (1, 2):
+            os.dup2(nowhere, number)
+        yield
+    finally:
+        ctypes.CDLL(None).fflush(None)  # what C still holds back
+        for number, before in zip((1, 2), kept, strict=True):
+            os.dup2(before, number)
+            os.close(before)
+        os.close(nowhere)
 
 
 def absent(peer: Peer, context: Context, section: str, name: str) -> Row | None:
