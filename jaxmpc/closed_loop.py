@@ -6,6 +6,8 @@ and some samples at a time. Everything else (the FMU, integer moves) steps on th
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -175,20 +177,34 @@ def _simulate_on_host(
         steppers[k].prepare(states[k], now)  # compile before the clock starts
     stepper, state = steppers[0], states[0]
     records, carried = [], None
-    for k in range(len(setpoints)):
-        cv = np.asarray(outputs.cv) + errors[k]
-        if k in takeovers:
-            stepper, state = steppers[k], handed_over(state, states[k])
-        if carried is None or blind is None:
-            state, record = stepper.step(state, cv, setpoints[k])
-            carried = CarriedOut(controller.structure, record) if k == blind else None
-        else:
-            record = carried.record(k - blind, cv)
-        outputs = host.step(record["mv_demand"], float(offsets[k]))
-        records.append(record | {"mv": np.asarray(outputs.mv)})
-        if progress is not None and ((k + 1) % 20 == 0 or k + 1 == len(setpoints)):
-            progress(k + 1, len(setpoints))
+    with _undisturbed():
+        for k in range(len(setpoints)):
+            cv = np.asarray(outputs.cv) + errors[k]
+            if k in takeovers:
+                stepper, state = steppers[k], handed_over(state, states[k])
+            if carried is None or blind is None:
+                state, record = stepper.step(state, cv, setpoints[k])
+                carried = CarriedOut(controller.structure, record) if k == blind else None
+            else:
+                record = carried.record(k - blind, cv)
+            outputs = host.step(record["mv_demand"], float(offsets[k]))
+            records.append(record | {"mv": np.asarray(outputs.mv)})
+            if progress is not None and ((k + 1) % 20 == 0 or k + 1 == len(setpoints)):
+                progress(k + 1, len(setpoints))
     return {name: np.stack([record[name] for record in records]) for name in records[0]}
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """No search for garbage among what is there already: compiled programs would keep it busy for a fifth of a second."""
+    if gc.get_freeze_count():  # the caller's business
+        yield
+        return
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 class _Compiled:
