@@ -33,6 +33,12 @@ WIDE = 128  # variables from which problems are solved one by one
 _COMPILED: set = set()  # forms of the relaxation that this process has called before
 
 
+def forget_programs() -> None:
+    """Drop the compiled programs of this process. Each takes memory mappings, of which Linux allows a process 65,530."""
+    jax.clear_caches()
+    _COMPILED.clear()
+
+
 @dataclasses.dataclass
 class Relaxations:
     """Results of a batch of relaxed problems, on the host; first axis is the batch.

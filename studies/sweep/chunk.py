@@ -23,6 +23,7 @@ from jaxmpc.batch import Lanes, controller_batch
 from jaxmpc.closed_loop import simulate_batches
 from jaxmpc.mixed_integer import MixedIntegerControllers
 from jaxmpc.plant import WellPlant
+from jaxmpc.relaxer import forget_programs
 from jaxmpc.step_response import StepResponseModel
 from jaxmpc.trajectory import AXES, TrajectoryBatch
 from jaxmpc.tuning import stack_tunings
@@ -68,6 +69,9 @@ def prepare_study(study: Study, progress: Callable[[int, int], None] | None = No
     return PreparedStudy(study, {point: jax.tree.map(np.asarray, model) for point, model in models.items()})
 
 
+_group_before: list[tuple[int, int]] = []  # the group of the chunk that ran last in this process
+
+
 def run_chunk(prepared: PreparedStudy, index: int) -> ChunkResult:
     """Run the closed loops of a chunk.
 
@@ -77,6 +81,9 @@ def run_chunk(prepared: PreparedStudy, index: int) -> ChunkResult:
     """
     study = prepared.study
     chunk = study.chunks[index]
+    if _group_before and _group_before[0] != (id(study), chunk.group):
+        forget_programs()  # another group has programs of its own; those of a dozen do not fit side by side
+    _group_before[:] = [(id(study), chunk.group)]
     fields, facts = run_scenarios(
         [study.scenario(int(k)) for k in chunk.scenarios],
         prepared.models,
