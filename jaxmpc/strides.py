@@ -317,10 +317,6 @@ def _programs(statics: _Statics):
     return jax.jit(functools.partial(_stride, statics)), jax.jit(functools.partial(_search, statics))
 
 
-def _loop(statics: _Statics, leaves) -> Loop:
-    return rebuilt(statics.form, leaves)
-
-
 def _decided(structure: Structure, loop: Loop, instance, root: Solved, gaps):
     """The compiled search of all scenarios whose root has a bound."""
 
@@ -337,7 +333,7 @@ def _search(statics: _Statics, leaves, packed, gaps):
     root = sample.root
     known = jnp.isfinite(sample.cv).all(axis=1)
     root = root._replace(bound=jnp.where(known, root.bound, jnp.nan))
-    found = _decided(statics.structure, _loop(statics, leaves), sample.instance, root, gaps)
+    found = _decided(statics.structure, rebuilt(statics.form, leaves), sample.instance, root, gaps)
     sample = sample._replace(x=found.x, good=found.closed, decided=found.closed)
     record = found.value, found.bound, found.nodes, found.finished_by, found.closed
     return statics.of_sample.pack(sample), jnp.stack([v.astype(float) for v in record], axis=1)
@@ -345,7 +341,8 @@ def _search(statics: _Statics, leaves, packed, gaps):
 
 def _stride(statics: _Statics, leaves, packed, inputs, gaps):
     """See `_Run.stride`."""
-    loop, sample = _loop(statics, leaves), statics.of_sample.unpack(packed)
+    loop: Loop = rebuilt(statics.form, leaves)
+    sample: Sample = statics.of_sample.unpack(packed)
     columns = np.asarray(integer_columns(statics.structure))
     cvs, mvs = sample.cv.shape[1], sample.state.mv.shape[1]
     setpoints, errors, offsets = inputs[..., :cvs], inputs[..., cvs : 2 * cvs], inputs[..., -1]

@@ -69,7 +69,9 @@ def prepare_study(study: Study, progress: Callable[[int, int], None] | None = No
     return PreparedStudy(study, {point: jax.tree.map(np.asarray, model) for point, model in models.items()})
 
 
-_group_before: list[tuple[int, int]] = []  # the group of the chunk that ran last in this process
+_program_before: list[
+    tuple
+] = []  # what the program of the chunk that ran last in this process was compiled for
 
 
 def run_chunk(prepared: PreparedStudy, index: int) -> ChunkResult:
@@ -81,14 +83,18 @@ def run_chunk(prepared: PreparedStudy, index: int) -> ChunkResult:
     """
     study = prepared.study
     chunk = study.chunks[index]
-    if _group_before and _group_before[0] != (id(study), chunk.group):
-        forget_programs()  # another group has programs of its own; those of a dozen do not fit side by side
-    _group_before[:] = [(id(study), chunk.group)]
+    group, lanes = study.groups[chunk.group], study.lanes(chunk.group)
+    own = group.kind, group.actuator, group.structure, group.samples, group.has_limits, group.whole_steps
+    program = *own, lanes
+    if _program_before != [program]:
+        if _program_before:
+            forget_programs()  # those of a dozen groups do not fit side by side
+        _program_before[:] = [program]
     fields, facts = run_scenarios(
         [study.scenario(int(k)) for k in chunk.scenarios],
         prepared.models,
-        lanes=study.lanes(chunk.group),
-        shared_model=len(study.groups[chunk.group].points) == 1,
+        lanes=lanes,
+        shared_model=len(group.points) == 1,
         plant_fields=study.varying_plant(chunk.group),
         points=len(stored_times(study)),
         every=study.definition.store.every,
