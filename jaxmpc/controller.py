@@ -17,6 +17,7 @@ from jaxmpc.blocking import block_members, first_position_rows, hard_rows, moves
 from jaxmpc.condense import CondensedQp, QpInstance, condense, make_instance
 from jaxmpc.disturbance import filter_bias
 from jaxmpc.errors import InputError
+from jaxmpc.gap import SMALLEST
 from jaxmpc.newton import WarmStart, warm_start_of
 from jaxmpc.relaxation import cold_start, shifted_start, solve_relaxed
 from jaxmpc.step_response import StepResponseModel, advance_free_response, check_match, shift_free_response
@@ -242,7 +243,7 @@ class ContinuousController(eqx.Module):
         moves = (solution.x * self.qp.scale).reshape(structure.mv_count, -1).T
         objective = solution.objective
         bound = jnp.minimum(jnp.maximum(solution.bound, 0.0), objective)
-        scale = jnp.maximum(jnp.abs(objective), 1e-6 * jnp.max(jnp.diagonal(self.qp.curvature)))
+        scale = jnp.maximum(jnp.abs(objective), SMALLEST * jnp.max(jnp.diagonal(self.qp.curvature)))
         gap = (objective - bound) / scale
         good = (solution.status == codes.OPTIMAL) & jnp.all(jnp.isfinite(moves)) & jnp.all(jnp.isfinite(cv))
         move = first_move(structure, self.qp.scale, instance, moves[0])

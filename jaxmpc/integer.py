@@ -22,6 +22,7 @@ from jaxmpc.condense import QpInstance
 from jaxmpc.constants import Constants
 from jaxmpc.cuts import Cuts
 from jaxmpc.enumeration import enumerate_all
+from jaxmpc.gap import closes
 from jaxmpc.levelset import LowerModel, enumerate_below, exclude
 from jaxmpc.newton import WarmStart
 from jaxmpc.outer_approximation import outer_approximation
@@ -113,8 +114,7 @@ def solve_integers(
     waiting, open_searches = [], []
     for i in range(count) if which is None else which:
         bound, value = max(float(root.bound[i]), 0.0), float(root.snapped[i])
-        scale = max(abs(value), 1e-6 * relaxer.scenario(i).scale)
-        if finish == "auto" and np.isfinite(value) and value - bound <= max(gap, 1e-9) * scale:
+        if finish == "auto" and closes(value, bound, relaxer.scenario(i).scale, gap):
             results[i] = _closed_by_root(relaxer, root, i, bound, seconds / count)
             continue
         waiting.append(i)

@@ -24,6 +24,7 @@ from jaxmpc.batch import Lanes, lanes_of
 from jaxmpc.condense import CondensedQp, QpInstance, make_instance
 from jaxmpc.controller import ControllerState, Memory, StepInfo, first_move, outside_limits
 from jaxmpc.errors import InputError
+from jaxmpc.gap import relative_gap
 from jaxmpc.integer import FINISHES
 from jaxmpc.newton import WarmStart
 from jaxmpc.packing import Packing
@@ -231,12 +232,6 @@ class MixedIntegerControllers:
             self._packings["remembered"] = packing
         scales, packings = self.scales_of(relaxer)[0], (of_observed, packing)
         return packing.unpack(np.asarray(_remember(self.memory, scales, observed, x, good, packings)))
-
-
-def relative_gap(value: np.ndarray, bound: np.ndarray, scale) -> np.ndarray:
-    """Gap of certified plans, relative to their values, or to a small share of the problem's scale if these are zero."""
-    with np.errstate(invalid="ignore"):
-        return np.maximum(value - bound, 0.0) / np.maximum(np.abs(value), 1e-6 * scale)
 
 
 _FIELDS = [field.name for field in dataclasses.fields(StepInfo)]

@@ -20,6 +20,7 @@ from jaxmpc.blocking import first_position_rows, moves_per_block, sample_moves
 from jaxmpc.condense import DRIFT, QpInstance, dynamic_matrix, make_instance
 from jaxmpc.constants import Constants
 from jaxmpc.errors import InputError
+from jaxmpc.gap import closes, relative_gap
 from jaxmpc.integer import FINISHES, continuous_feasible
 from jaxmpc.newton import WarmStart
 from jaxmpc.packing import Packing, flattened, rebuilt
@@ -219,7 +220,7 @@ class Planner:
             return SearchResult(None, np.inf, -np.inf, codes.FAILED, None, 1)
         value = float(root.objective[0])
         bound = min(max(float(root.bound[0]), 0.0), value)
-        closed = value - bound <= max(gap, 1e-9) * max(abs(value), 1e-6 * relaxer.scenario(0).scale)
+        closed = closes(value, bound, relaxer.scenario(0).scale, gap)
         status, by = (codes.OPTIMAL, "relaxation") if closed else (codes.LIMIT, None)
         return SearchResult(root.x[0], value, bound, status, by, 1, root.start(0))
 
@@ -245,16 +246,14 @@ class Planner:
         moves = (x * np.asarray(constants.qp.scale)).reshape(self.structure.mv_count, -1).T
         objective, cv, eps = self.objective(moves, free_response, setpoint)
         bound = min(result.bound, objective)
-        reference = max(abs(objective), 1e-6 * constants.scale)
-        relative = max(objective - bound, 0.0) / reference
         state = result.status
-        if state == codes.OPTIMAL and relative > max(gap, 1e-9):
+        if state == codes.OPTIMAL and not closes(objective, bound, constants.scale, gap):
             state = codes.LIMIT
         return Plan(
             status=codes.STATUS[state],
             objective=objective,
             bound=bound,
-            gap=relative,
+            gap=float(relative_gap(objective, bound, constants.scale)),
             moves=moves,
             mv=mv_now + np.cumsum(sample_moves(self.structure) @ moves, axis=0),
             cv=cv,

@@ -19,9 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.batch import Lanes, lanes_of
-from jaxmpc.compiled_search import Decision, Tables, decide, searchable
+from jaxmpc.compiled_lists import Tables
+from jaxmpc.compiled_search import Decision, decide, searchable
 from jaxmpc.condense import QpInstance
 from jaxmpc.constants import Constants
+from jaxmpc.gap import FINEST
 from jaxmpc.newton import WarmStart
 from jaxmpc.packing import Packing
 from jaxmpc.relaxation import Solved, relax
@@ -239,7 +241,7 @@ class Relaxer:
                 problems,
                 index[pad],
                 lanes,
-                max(gap, 1e-9),
+                max(gap, FINEST),
                 packings,
             )
             form = "decide", problems.shape, lanes.shape, packings, jax.tree.structure((shared, own))

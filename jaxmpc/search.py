@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxmpc.condense import QpInstance
 from jaxmpc.constants import Constants
+from jaxmpc.gap import FINEST, SMALLEST, closes
 from jaxmpc.levelset import LowerModel
 from jaxmpc.newton import WarmStart
 from jaxmpc.propagation import Chain, chains_of, nearest, satisfied
@@ -76,7 +77,8 @@ class Search:
         gap: float,
         time_limit: float | None,
     ):
-        self.constants, self.instance, self.gap, self.time_limit = constants, instance, gap, time_limit
+        self.constants, self.instance, self.time_limit = constants, instance, time_limit
+        self.gap = max(gap, FINEST)
         self.limits = np.asarray(instance.lower), np.asarray(instance.upper)
         self.chains: list[Chain] = chains_of(
             constants.structure, np.asarray(instance.row_low), np.asarray(instance.row_high)
@@ -93,12 +95,12 @@ class Search:
     @property
     def cutoff(self) -> float:
         """Bounds from here on cannot improve the incumbent by more than the gap."""
-        return self.value - 0.5 * max(self.gap, 1e-9) * self.reference if np.isfinite(self.value) else np.inf
+        return self.value - 0.5 * self.gap * self.reference if np.isfinite(self.value) else np.inf
 
     @property
     def reference(self) -> float:
         """What gaps are relative to: the incumbent's value, or a small share of the problem's scale if that is zero."""
-        return max(abs(self.value), 1e-6 * self.constants.scale)
+        return max(abs(self.value), SMALLEST * self.constants.scale)
 
     def out_of_time(self) -> bool:
         """Whether the time limit is used up."""
@@ -190,6 +192,6 @@ class Search:
         if self.x is None:
             status = INFEASIBLE if by is not None else FAILED
             return SearchResult(None, np.inf, np.inf if by else bound, status, by, self.nodes)
-        closed = self.value - bound <= max(self.gap, 1e-9) * self.reference
+        closed = closes(self.value, bound, self.constants.scale, self.gap)
         status, by = (OPTIMAL, by) if closed else (LIMIT, None)
         return SearchResult(self.x, self.value, bound, status, by, self.nodes, self.start)

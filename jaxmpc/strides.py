@@ -21,11 +21,12 @@ from jaxtyping import Array, Bool, Float
 
 from jaxmpc import status as codes
 from jaxmpc.batch import Lanes
-from jaxmpc.compiled_search import closes, decide
+from jaxmpc.compiled_search import decide
 from jaxmpc.condense import QpInstance, integer_columns
 from jaxmpc.controller import ControllerState
+from jaxmpc.gap import FINEST, closes, relative_gap
 from jaxmpc.integer import compiles, solve_integers
-from jaxmpc.mixed_integer import MixedIntegerControllers, observed, relative_gap, remembered
+from jaxmpc.mixed_integer import MixedIntegerControllers, observed, remembered
 from jaxmpc.packing import Packing, flattened, rebuilt
 from jaxmpc.plant import WellPlant, WellState
 from jaxmpc.relaxation import Solved
@@ -207,7 +208,7 @@ class _Run:
             Loop(memory, qps, self.narrow.tables, rows, controllers.scales_of(self.narrow)[0], plants)
         )
         scale = controllers.scales_of(self.narrow)[1]
-        self.gaps = np.stack([np.full(self.count, max(controllers.gap, 1e-9)), 1e-6 * scale], axis=1)
+        self.gaps = np.stack([np.full(self.count, max(controllers.gap, FINEST)), scale], axis=1)
 
     def start(self) -> _Stage:
         """Before the first sample, everything compiled."""
@@ -375,11 +376,11 @@ def _stride(statics: _Statics, leaves, packed, inputs, gaps):
         )
         assert root is not None
         known = jnp.isfinite(sample.cv).all(axis=1)
-        closed = known & closes(root, gaps[:, 1], gaps[:, 0])
         x = root.warm.x
         x = x.at[:, columns].set(jnp.round(x[:, columns]))
         value, steps = root.snapped, root.steps.astype(int)
         bound = jnp.minimum(jnp.maximum(root.bound, 0.0), value)
+        closed = known & closes(value, bound, gaps[:, 1], gaps[:, 0])
         nodes, finished_by = jnp.ones_like(steps), jnp.full_like(steps, RELAXATION)
         if statics.inside:
             open_root = root._replace(bound=jnp.where(closed | ~known, jnp.nan, root.bound))

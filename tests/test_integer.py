@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmpc import compiled_search, status
-from jaxmpc.compiled_search import Tables
+from jaxmpc import compiled_lists, compiled_search, status
+from jaxmpc.compiled_lists import Tables
 from jaxmpc.condense import condense, make_instance
 from jaxmpc.constants import Constants
 from jaxmpc.cuts import Cuts
@@ -208,12 +208,12 @@ def searched(structure, problem):
     )(instance, lane(root))
 
 
-@pytest.mark.parametrize("free", [compiled_search.GRID_FREE, 0])
+@pytest.mark.parametrize("free", [compiled_lists.GRID_FREE, 0])
 def test_the_compiled_search_finds_the_best_whole_plan_and_proves_it(
     small_structure, problems, monkeypatch, free
 ):
     """From the grid of all combinations, and from the list that is made move by move."""
-    monkeypatch.setattr(compiled_search, "GRID_FREE", free)
+    monkeypatch.setattr(compiled_lists, "GRID_FREE", free)
     closed = 0
     for problem in problems:
         found = searched(small_structure, problem)
@@ -227,8 +227,8 @@ def test_the_compiled_search_finds_the_best_whole_plan_and_proves_it(
 
 
 def test_a_list_that_does_not_fit_is_not_claimed_to_be_done(small_structure, problems, monkeypatch):
-    monkeypatch.setattr(compiled_search, "GRID_FREE", 0)
-    monkeypatch.setattr(compiled_search, "LONGEST", 256)
+    monkeypatch.setattr(compiled_lists, "GRID_FREE", 0)
+    monkeypatch.setattr(compiled_lists, "LONGEST", 256)
     monkeypatch.setattr(compiled_search, "MOST_SOLVED", 2)
     for problem in problems:
         found = searched(small_structure, problem)
