@@ -69,9 +69,7 @@ def prepare_study(study: Study, progress: Callable[[int, int], None] | None = No
     return PreparedStudy(study, {point: jax.tree.map(np.asarray, model) for point, model in models.items()})
 
 
-_program_before: list[
-    tuple
-] = []  # what the program of the chunk that ran last in this process was compiled for
+_program_before: list[tuple] = []  # the one of the last chunk in this process
 
 
 def run_chunk(prepared: PreparedStudy, index: int) -> ChunkResult:
