@@ -81,7 +81,9 @@ def simulate(
     deviation, stream = check_deviation(noise, structure.cv_count), check_seed(seed)
     if deviation.ndim > 1 or stream.ndim:
         raise InputError("noise", noise, "one standard deviation per CV and one seed, for one run")
-    errors = np.asarray(_noise(deviation, stream, 0, np.arange(len(setpoints))))
+    errors = np.zeros((len(setpoints), structure.cv_count))
+    if deviation.any():
+        errors = np.asarray(_noise(deviation, stream, 0, np.arange(len(setpoints))))
     inputs = setpoints, offsets, errors
     takeovers, blind = checked_changes(controller, changes, len(setpoints)), None
     if open_loop_from is not None:

@@ -24,6 +24,8 @@ from jaxmpc.step_response import StepResponseModel, advance_free_response, check
 from jaxmpc.structure import Structure
 from jaxmpc.tuning import Tuning
 
+_condense = eqx.filter_jit(condense)  # one program in place of a hundred operations
+
 
 class ControllerState(eqx.Module):
     """What a controller remembers from sample to sample.
@@ -196,7 +198,7 @@ class ContinuousController(eqx.Module):
         self.memory = Memory(
             structure, tuning, model.extended(max(structure.prediction_horizon, model.samples))
         )
-        self.qp = condense(structure, tuning, model.coefficients, envelope=0, summed=summed)
+        self.qp = _condense(structure, tuning, model.coefficients, envelope=0, summed=summed)
 
     @property
     def structure(self) -> Structure:

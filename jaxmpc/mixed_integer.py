@@ -34,6 +34,7 @@ from jaxmpc.relaxer import Relaxer, relaxations
 from jaxmpc.step_response import StepResponseModel, check_match
 from jaxmpc.step_solver import StepSolver
 from jaxmpc.structure import Structure, check_vector
+from jaxmpc.threads import compile_together
 from jaxmpc.tuning import Tuning
 
 
@@ -130,11 +131,14 @@ class MixedIntegerControllers:
 
     def prepare(self, state: ControllerState, cv: Float[np.ndarray, "scenario cv"]) -> None:
         """Compile what nearly every sample needs; arguments as in `step`."""
-        self.step(state, cv, cv)
-        if self.solver.narrow:
-            narrow = self.solver.relaxer(1)
-            _, (state, _, instances, _) = self._observe(narrow, state, cv, np.asarray(cv, dtype=np.float64))
-            narrow.compile(instances, state.warm)
+        step = lambda: self.step(state, cv, cv)  # noqa: E731
+        if not self.solver.narrow:
+            step()
+            return
+        qps, rows, columns = self.constants
+        _, _, shapes, _ = jax.eval_shape(observed, self.memory, qps, rows, columns, state, cv, cv)
+        blank = jax.tree.map(lambda v: np.zeros(v.shape, v.dtype), shapes)
+        compile_together(step, lambda: self.solver.relaxer(1).compile(blank, state.warm))
 
     def step(
         self,

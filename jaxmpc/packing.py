@@ -56,13 +56,28 @@ class Packing:
         return self.form.unflatten(parts)
 
 
-def flattened(tree: Any) -> tuple[list[jax.Array], Any]:
-    """The arrays of a tree, and its form, which is hashable if all else in the tree is."""
+class Form:
+    """All of a tree but its arrays, as a static argument: hashed once, where a module would be at every call."""
+
+    def __init__(self, structure: Any, rest: Any):
+        self.structure, self.rest = structure, rest
+        self._hash = hash((structure, rest))
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __eq__(self, other: object) -> bool:
+        if self is other or not isinstance(other, Form):
+            return self is other
+        return self._hash == other._hash and (self.structure, self.rest) == (other.structure, other.rest)
+
+
+def flattened(tree: Any) -> tuple[list[jax.Array], Form]:
+    """The arrays of a tree, and its form; all else in the tree must be hashable."""
     arrays, rest = eqx.partition(tree, eqx.is_array_like)
-    return [jnp.asarray(leaf) for leaf in jax.tree.leaves(arrays)], (jax.tree.structure(arrays), rest)
+    return [jnp.asarray(leaf) for leaf in jax.tree.leaves(arrays)], Form(jax.tree.structure(arrays), rest)
 
 
-def rebuilt(form: Any, leaves: Any) -> Any:
+def rebuilt(form: Form, leaves: Any) -> Any:
     """The tree again; see `flattened`."""
-    structure, rest = form
-    return eqx.combine(jax.tree.unflatten(structure, leaves), rest)
+    return eqx.combine(jax.tree.unflatten(form.structure, leaves), form.rest)

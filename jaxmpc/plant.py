@@ -207,6 +207,7 @@ def _known(choke, lift, disturbance, parameters) -> bool:
     return all(isinstance(a, (int, float)) and a == b for a, b in zip(here, there, strict=True))
 
 
+@jax.jit
 def _outputs(x, position, lift, disturbance, parameters) -> WellOutputs:
     _, y = model(JaxOps, tuple(x), (position, lift, disturbance), parameters)
     return WellOutputs(jnp.stack(y[:2]), jnp.stack([position, lift]), *y[2:])

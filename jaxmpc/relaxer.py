@@ -25,7 +25,7 @@ from jaxmpc.condense import QpInstance
 from jaxmpc.constants import Constants
 from jaxmpc.gap import FINEST
 from jaxmpc.newton import WarmStart
-from jaxmpc.packing import Packing
+from jaxmpc.packing import Packing, flattened, rebuilt
 from jaxmpc.relaxation import Solved, relax
 
 SIZES = (1, 8, 64)  # lanes of a call, one compiled program each; a batch is padded to the least that holds it
@@ -81,10 +81,12 @@ class Relaxations:
         return Relaxations(**{k: jax.tree.map(lambda leaf: leaf[begin:end], v) for k, v in own.items()})
 
 
-@functools.partial(jax.jit, static_argnames=("structure", "packings"))
-def _decide(structure, shared, own, rows, problems, index, roots, gap, packings):
+@functools.partial(jax.jit, static_argnames=("structure", "form", "packings"))
+def _decide(structure, leaves, problems, index, roots, gap, form, packings):
     """Searches of lanes that belong to the scenarios `index`; goes in and comes out packed."""
     of_instances, of_solved = packings
+    lanes, tables, rows, _ = rebuilt(form, leaves)
+    shared, own = (lanes.shared, tables.shared), (lanes.each, tables.each)
     pick = lambda tree: jax.tree.map(lambda leaf: leaf[index], tree)  # noqa: E731
 
     def lane(own, instance, root):
@@ -95,16 +97,17 @@ def _decide(structure, shared, own, rows, problems, index, roots, gap, packings)
     return Packing.of(found).pack(found)
 
 
-@functools.partial(jax.jit, static_argnames="packings")
-def _relax(shared, own, rows, integer, problems, index, lanes, packings):
+@functools.partial(jax.jit, static_argnames=("form", "packings"))
+def _relax(leaves, problems, index, lanes, form, packings):
     """Relaxations of lanes that belong to the scenarios `index`; goes in and comes out packed."""
     of_instances, of_lanes, of_solved = packings
+    qps, _, rows, integer = rebuilt(form, leaves)
     pick = lambda tree: jax.tree.map(lambda leaf: leaf[index], tree)  # noqa: E731
 
     def lane(own, instance, given):
-        return relax(eqx.combine(own, shared), rows, integer, instance, *given)
+        return relax(eqx.combine(own, qps.shared), rows, integer, instance, *given)
 
-    solved = jax.vmap(lane)(pick(own), of_instances.unpack(problems[index]), of_lanes.unpack(lanes))
+    solved = jax.vmap(lane)(pick(qps.each), of_instances.unpack(problems[index]), of_lanes.unpack(lanes))
     return of_solved.pack(solved)
 
 
@@ -146,6 +149,7 @@ class Relaxer:
         self.hard, self.columns = jnp.asarray(self.rows), jnp.asarray(self.integer)
         self.one = len(constants) == 1
         self.compiling = 0.0  # seconds of first calls so far
+        self._called: set = set()  # keys of forms that need no other look
         rows, n = first.qp.response.shape
         self.sizes = SIZES if n <= WIDE else SIZES[:1]
         self.predictions = rows - len(first.knot)
@@ -164,7 +168,8 @@ class Relaxer:
     def part(self, index: np.ndarray) -> Relaxer:
         """The relaxations of some scenarios; nothing is compiled or computed again."""
         some = copy.copy(self)
-        some.compiling = 0.0
+        some.compiling, some._called = 0.0, set()
+        some.__dict__.pop("_flat", None)
         if not self.one:
             some.constants, some.lanes = [self.constants[i] for i in index], self.lanes.take(index)
             if self.tables is not None:
@@ -212,6 +217,11 @@ class Relaxer:
         """What compiled searches read; None where they do not know the structure."""
         return lanes_of([Tables.of(c) for c in self.constants]) if searchable(self.structure) else None
 
+    @functools.cached_property
+    def _flat(self) -> tuple[list[jax.Array], Any]:
+        """All constants, taken apart."""
+        return flattened((self.lanes, self.tables, self.hard, self.columns))
+
     def decide(self, instances: QpInstance, index: np.ndarray, roots: Relaxations, gap: float) -> Decision:
         """Search scenarios in compiled programs, as far as these go.
 
@@ -225,27 +235,18 @@ class Relaxer:
         of_instances, count = Packing.of(instances), len(index)
         problems = of_instances.pack(jax.tree.map(np.asarray, instances))
         solved = self.of_solved.pack(roots.solved)
-        shared, own = (self.lanes.shared, self.tables.shared), (self.lanes.each, self.tables.each)
+        (leaves, form), packings = self._flat, (of_instances, self.of_solved)
         parts, begin = [], 0
         while begin < count:
             size = next((s for s in self.sizes if s >= count - begin), self.sizes[-1])
             pad = np.minimum(begin + np.arange(size), count - 1)
             lanes = solved[index[pad]]
             lanes[count - begin :] = np.nan  # no root: nothing is searched
-            packings = of_instances, self.of_solved
-            arguments = (
-                self.structure,
-                shared,
-                own,
-                self.hard,
-                problems,
-                index[pad],
-                lanes,
-                max(gap, FINEST),
-                packings,
-            )
-            form = "decide", problems.shape, lanes.shape, packings, jax.tree.structure((shared, own))
-            parts.append(self._timed(form, lambda a=arguments: np.asarray(_decide(*a)))[: count - begin])
+            arguments = self.structure, leaves, problems, index[pad], lanes, max(gap, FINEST), form, packings
+            call = lambda a=arguments: np.asarray(_decide(*a))  # noqa: E731
+            key = "decide", problems.shape, lanes.shape
+            found = self._timed(key, (self.structure, packings, form), call)
+            parts.append(found[: count - begin])
             begin += size
         found = parts[0] if len(parts) == 1 else np.concatenate(parts)
         return self.of_decision.unpack(found)
@@ -286,16 +287,23 @@ class Relaxer:
 
     def _call(self, problems, index, lanes, of_instances: Packing) -> np.ndarray:
         """Call the relaxation; compilation is not held against a time limit."""
-        packings = of_instances, self.of_lanes, self.of_solved
-        arguments = (self.lanes.shared, self.lanes.each, self.hard, self.columns, problems, index, lanes)
-        form = problems.shape, lanes.shape, packings, jax.tree.structure(arguments)
-        return self._timed(form, lambda: np.asarray(_relax(*arguments, packings=packings)))
+        (leaves, form), packings = self._flat, (of_instances, self.of_lanes, self.of_solved)
+        call = lambda: np.asarray(_relax(leaves, problems, index, lanes, form, packings))  # noqa: E731
+        return self._timed(("relax", problems.shape, lanes.shape), (packings, form), call)
 
-    def _timed(self, form, call):
-        """The result of a compiled call; what a first call of its form takes is counted as compilation."""
-        if form not in _COMPILED:
-            begin = time.perf_counter()
-            call()
-            _COMPILED.add(form)
-            self.compiling += time.perf_counter() - begin
+    def _timed(self, key, form, call):
+        """The result of a compiled call; what a first call of its form takes is counted as compilation.
+
+        Args:
+            key: of the form among those of this relaxer.
+            form: what else is compiled for.
+            call: of the program.
+        """
+        if key not in self._called:
+            if (key, form) not in _COMPILED:
+                begin = time.perf_counter()
+                call()
+                _COMPILED.add((key, form))
+                self.compiling += time.perf_counter() - begin
+            self._called.add(key)
         return call()

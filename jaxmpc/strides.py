@@ -30,9 +30,9 @@ from jaxmpc.mixed_integer import MixedIntegerControllers, observed, remembered
 from jaxmpc.packing import Packing, flattened, rebuilt
 from jaxmpc.plant import WellPlant, WellState
 from jaxmpc.relaxation import Solved
-from jaxmpc.relaxer import relaxations
+from jaxmpc.relaxer import Relaxations, relaxations
 from jaxmpc.structure import Structure
-from jaxmpc.threads import parts_of, side_by_side
+from jaxmpc.threads import compile_together, parts_of, side_by_side
 
 LONGEST = 32  # samples of one call
 TOGETHER = 16  # scenarios of one call
@@ -224,11 +224,10 @@ class _Run:
         sample = Sample(state, plant_state, cv, instance, root, np.zeros_like(root.warm.x), no, no)
         self.of_sample = Packing.of(sample)
         statics = _Statics(c.structure, self.form, self.of_sample, self.count > 1)
-        self.program, self.search = _programs(statics)
+        self.program = _program(statics)
         stage = _Stage(self.of_sample.pack(sample), False)
-        later, *_ = self.stride(stage, 0)
-        if self.count == 1:
-            jax.block_until_ready(self.search(self.leaves, later.packed, self.gaps))
+        search = lambda: self.narrow.compile(instance, state.warm)  # noqa: E731
+        compile_together(lambda: self.stride(stage, 0), *([search] if self.count == 1 else []))
         return stage
 
     def stride(self, stage: _Stage, begin: int) -> tuple[_Stage, Seen, Done, int]:
@@ -246,28 +245,31 @@ class _Run:
     def decide(self, stage: _Stage, fields: dict[str, np.ndarray], at: int) -> _Stage:
         """Decide sample `at`, alone or on the host, and record how."""
         begin = time.perf_counter()
-        if self.count == 1:
-            packed, found = self.search(self.leaves, stage.packed, self.gaps)
-            objective, bound, nodes, finished_by, closed = np.asarray(found)[0]
-            if closed:
-                found = dict(objective=objective, bound=bound, nodes=nodes, finished_by=finished_by)
-                for name, value in found.items():
-                    fields[name][0, at] = value
+        sample: Sample = self.of_sample.unpack(np.array(stage.packed))
+        root = relaxations(sample.root, self.narrow.predictions)
+        if self.count == 1 and np.isfinite(sample.cv).all():
+            found = self.narrow.decide(sample.instance, np.zeros(1, dtype=int), root, self.controllers.gap)
+            if found.closed[0]:
+                done = sample._replace(x=found.x, good=found.closed, decided=found.closed)
+                stage = _Stage(self.of_sample.pack(done), True)
+                for name in ("bound", "nodes", "finished_by"):
+                    fields[name][0, at] = getattr(found, name)[0]
+                fields["objective"][0, at] = found.value[0]
                 fields["solve_time"][0, at] += time.perf_counter() - begin
-                return _Stage(packed, True)
-        seconds = time.perf_counter() - begin
-        return self._on_host(stage, fields, at, seconds)
+                return stage
+        return self._on_host(sample, root, fields, at, time.perf_counter() - begin)
 
-    def _on_host(self, stage: _Stage, fields: dict[str, np.ndarray], at: int, seconds: float) -> _Stage:
-        c, packed = self.controllers, np.array(stage.packed)
-        sample: Sample = self.of_sample.unpack(packed)
+    def _on_host(
+        self, sample: Sample, root: Relaxations, fields: dict[str, np.ndarray], at: int, seconds: float
+    ) -> _Stage:
+        c = self.controllers
         which = np.flatnonzero(~sample.decided)
         starts = c.solver.starts(self.narrow, np.asarray(sample.state.plan))
         results, _ = solve_integers(
             self.narrow,
             sample.instance,
             starts=starts,
-            root=relaxations(sample.root, self.narrow.predictions),
+            root=root,
             gap=c.gap,
             time_limit=c.time_limit,
             which=which,
@@ -313,9 +315,9 @@ class _Statics(NamedTuple):
 
 
 @functools.lru_cache(maxsize=64)
-def _programs(statics: _Statics):
-    """The compiled stride and search of loops of one form."""
-    return jax.jit(functools.partial(_stride, statics)), jax.jit(functools.partial(_search, statics))
+def _program(statics: _Statics):
+    """The compiled stride of loops of one form."""
+    return jax.jit(functools.partial(_stride, statics))
 
 
 def _decided(structure: Structure, loop: Loop, instance, root: Solved, gaps):
@@ -326,18 +328,6 @@ def _decided(structure: Structure, loop: Loop, instance, root: Solved, gaps):
         return decide(structure, qp, tables, loop.rows, instance, root, gap)
 
     return jax.vmap(lane)((loop.qps.each, loop.tables.each), instance, root, gaps[:, 0])
-
-
-def _search(statics: _Statics, leaves, packed, gaps):
-    """Search a packed sample: the same, decided where that was possible, and what the record keeps."""
-    sample: Sample = statics.of_sample.unpack(packed)
-    root = sample.root
-    known = jnp.isfinite(sample.cv).all(axis=1)
-    root = root._replace(bound=jnp.where(known, root.bound, jnp.nan))
-    found = _decided(statics.structure, rebuilt(statics.form, leaves), sample.instance, root, gaps)
-    sample = sample._replace(x=found.x, good=found.closed, decided=found.closed)
-    record = found.value, found.bound, found.nodes, found.finished_by, found.closed
-    return statics.of_sample.pack(sample), jnp.stack([v.astype(float) for v in record], axis=1)
 
 
 def _stride(statics: _Statics, leaves, packed, inputs, gaps):

@@ -41,7 +41,11 @@ def controller_of(kind, model):
 )
 @pytest.mark.parametrize(
     ("kind", "actuator"),
-    [(ContinuousController, "continuous"), (ContinuousController, "step"), (MixedIntegerController, "step")],
+    [
+        pytest.param(ContinuousController, "continuous", marks=pytest.mark.slow),
+        (ContinuousController, "step"),
+        (MixedIntegerController, "step"),
+    ],
 )
 def test_the_fmu_and_the_jax_well_close_the_same_loop(model, kind, actuator):
     from identify.fmu import FmuPlant

@@ -164,7 +164,13 @@ def test_models_that_do_not_fill_a_grid_are_refused(well_like_model):
         make_schedule([dataclasses.replace(models[0], working_point=(("choke", 10.0),))])
 
 
-@BOTH
+@pytest.mark.parametrize(
+    "make",
+    [
+        pytest.param(continuous_of, marks=pytest.mark.slow, id="continuous"),
+        pytest.param(integer_of, id="mixed-integer"),
+    ],
+)
 def test_equal_models_everywhere_decide_like_the_single_model(
     make, even, well_like_model, small_structure, thesis_fields
 ):

@@ -195,28 +195,31 @@ def test_an_expired_time_limit_returns_a_feasible_plan_with_its_true_gap(problem
     assert status.LIMIT in seen
 
 
-def searched(structure, problem):
-    """What the compiled search finds for one of `problems`."""
-    constants, instance, _, _ = problem
-    relaxer = Relaxer([constants])
-    root = relaxer.solve_roots(one(instance), one(constants.cold)).solved
-    lane = lambda tree: jax.tree.map(lambda leaf: leaf[0], tree)  # noqa: E731
-    return jax.jit(
-        lambda instance, root: compiled_search.decide(
-            structure, constants.qp, Tables.of(constants), relaxer.rows, instance, root, 1e-6
-        )
-    )(instance, lane(root))
+@pytest.fixture
+def searched(small_structure):
+    """What the compiled search finds for one of `problems`; compiled after constants of it were changed."""
+
+    @jax.jit
+    def decide(qp, tables, rows, instance, root):
+        return compiled_search.decide(small_structure, qp, tables, rows, instance, root, 1e-6)
+
+    def search(problem):
+        constants, instance, _, _ = problem
+        relaxer = Relaxer([constants])
+        root = relaxer.solve_roots(one(instance), one(constants.cold)).solved
+        root = jax.tree.map(lambda leaf: leaf[0], root)
+        return decide(constants.qp, Tables.of(constants), relaxer.rows, instance, root)
+
+    return search
 
 
 @pytest.mark.parametrize("free", [compiled_lists.GRID_FREE, 0])
-def test_the_compiled_search_finds_the_best_whole_plan_and_proves_it(
-    small_structure, problems, monkeypatch, free
-):
+def test_the_compiled_search_finds_the_best_whole_plan_and_proves_it(searched, problems, monkeypatch, free):
     """From the grid of all combinations, and from the list that is made move by move."""
     monkeypatch.setattr(compiled_lists, "GRID_FREE", free)
     closed = 0
     for problem in problems:
-        found = searched(small_structure, problem)
+        found = searched(problem)
         if found.closed:
             best = problem[3].min()
             assert float(found.value) == pytest.approx(best, rel=1e-6, abs=1e-9)
@@ -226,17 +229,17 @@ def test_the_compiled_search_finds_the_best_whole_plan_and_proves_it(
     assert closed >= 10  # the others are left to the host, which solves all of them
 
 
-def test_a_list_that_does_not_fit_is_not_claimed_to_be_done(small_structure, problems, monkeypatch):
+def test_a_list_that_does_not_fit_is_not_claimed_to_be_done(searched, problems, monkeypatch):
     monkeypatch.setattr(compiled_lists, "GRID_FREE", 0)
     monkeypatch.setattr(compiled_lists, "LONGEST", 256)
     monkeypatch.setattr(compiled_search, "MOST_SOLVED", 2)
     for problem in problems:
-        found = searched(small_structure, problem)
+        found = searched(problem)
         if found.closed:
             assert float(found.value) == pytest.approx(problem[3].min(), rel=1e-6, abs=1e-9)
 
 
-def test_a_batch_of_compiled_searches_in_lockstep_is_each_alone(small_structure, problems):
+def test_a_batch_of_compiled_searches_in_lockstep_is_each_alone(small_structure, searched, problems):
     """What an accelerator runs for scenarios of one controller."""
     constants = problems[0][0]
     relaxer = Relaxer([constants])
@@ -252,7 +255,7 @@ def test_a_batch_of_compiled_searches_in_lockstep_is_each_alone(small_structure,
 
     together = jax.jit(jax.vmap(lane))(instances, roots)
     for k, problem in enumerate(problems):
-        alone = searched(small_structure, problem)
+        alone = searched(problem)
         assert bool(together.closed[k]) == bool(alone.closed)
         if alone.closed:
             np.testing.assert_allclose(together.value[k], alone.value, rtol=1e-6)

@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmpc.batch import Lanes
 from jaxmpc.newton import WarmStart
-from jaxmpc.packing import Packing
+from jaxmpc.packing import Packing, flattened, rebuilt
 
 
 def tree():
@@ -40,3 +41,15 @@ def test_packings_of_equal_shapes_are_one_static_argument():
     assert Packing.of(tree()) == Packing.of(shapes)
     assert hash(Packing.of(tree())) == hash(Packing.of(shapes))
     assert Packing.of(tree()) != Packing.of(tree()[0])
+
+
+def test_a_module_taken_apart_is_the_same_module_and_its_form_a_static_argument():
+    each = WarmStart(*(np.full(n, 1.0) for n in (4, 7, 6, 4, 2)))
+    other = jax.tree.map(lambda v: 2.0 * v, each)
+    (leaves, form), (others, same) = (flattened(Lanes(own, (None, "shared"))) for own in (each, other))
+    assert form == same and hash(form) == hash(same)  # arrays are not part of it
+    assert_same(rebuilt(form, leaves).each, each)
+    assert_same(rebuilt(form, others).each, other)
+    assert rebuilt(form, leaves).shared == (None, "shared")
+    assert form != flattened(Lanes(each, (None, "another")))[1]
+    assert form != leaves

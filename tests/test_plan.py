@@ -67,6 +67,7 @@ COMPILED_APART = {
     "forced_moves",
     "free_slack",
     "no_cv_limits",
+    "forced_moves_beyond_the_limit",
 }
 
 
@@ -210,6 +211,7 @@ def same_plan(one, other, body: dict) -> None:
         assert np.abs(other.moves[:, m] - one.moves[:, m]).max() <= tolerance
 
 
+@pytest.mark.slow
 def test_blocks_of_one_are_no_blocking_in_either_mode():
     for seed in range(5):
         body = twisted(seed, dict(hu=4))

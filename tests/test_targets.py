@@ -48,7 +48,12 @@ def step_from_steady(controller, *, target=TARGET, setpoint=SETPOINT, samples=1)
 
 
 @pytest.mark.parametrize(
-    ("integer", "blocking", "first_penalised"), [(True, "moves", 4), (True, "inputs", 1), (False, "moves", 1)]
+    ("integer", "blocking", "first_penalised"),
+    [
+        (True, "moves", 4),
+        pytest.param(True, "inputs", 1, marks=pytest.mark.slow),
+        (False, "moves", 1),
+    ],
 )
 def test_the_objective_is_that_of_the_problem_plus_the_price_of_the_inputs(
     well_like_model, small_structure, thesis_fields, integer, blocking, first_penalised
