@@ -189,11 +189,21 @@ def build_lanes(build: Callable[[Any], T], each: Any, count: int) -> Lanes[T]:
 def _depends(function: Callable[[Any], list], argument) -> list[bool]:
     """Which results depend on the argument: those that its values reach in the traced program."""
     program = jax.make_jaxpr(function)(argument).jaxpr
-    reached = set(program.invars)
+    return _reached(program, [True] * len(program.invars))
+
+
+def _reached(program: Any, given: Sequence[bool]) -> list[bool]:
+    """Which results of a traced program some of its arguments reach."""
+    reached = {v for v, its in zip(program.invars, given, strict=True) if its}
     follows = lambda v: not isinstance(v, Literal) and v in reached  # noqa: E731
     for equation in program.eqns:
-        if any(follows(v) for v in equation.invars):
-            reached.update(equation.outvars)
+        into = [follows(v) for v in equation.invars]
+        if not any(into):
+            continue
+        out = [True] * len(equation.outvars)
+        if equation.primitive.name in ("jit", "pjit"):  # a compiled function has results of its own
+            out = _reached(equation.params["jaxpr"].jaxpr, into)
+        reached |= {v for v, its in zip(equation.outvars, out, strict=True) if its}
     return [follows(v) for v in program.outvars]
 
 
