@@ -123,7 +123,9 @@ def _(explore, mo):
 def _(choices_panel, length, mo, model_panel, page, setpoint_panel, tuning_panel):
     _step = [] if length.value else [setpoint_panel]
     _shown = [choices_panel, tuning_panel, *_step, model_panel] if page.value == "Run a loop" else []
-    mo.sidebar([mo.vstack([page, *_shown], gap=0.4)], width="330px")
+    # panels are as high as what is in them; by themselves they would share the height of the page evenly
+    _panels = [panel.style(flex="none") for panel in _shown]
+    mo.sidebar([mo.vstack([page, *_panels], gap=0.4)], width="330px")
     return
 
 
@@ -275,7 +277,9 @@ def _(chart, draw, mo, path):
     if chart is not None and 0 < len(chart.value) < len(chart.dataframe):  # all of them: none is picked
         picked = chart.value.iloc[0]
     again = mo.ui.run_button(
-        label="Run it again, every sample", disabled=picked is None or draw.is_comparison(path.value.strip())
+        label="Run it in full",
+        tooltip="closes this loop again and shows every sample",
+        disabled=picked is None or draw.is_comparison(path.value.strip()),
     )
     return again, picked
 
@@ -304,7 +308,7 @@ def _(InputError, again, draw, mo, page, path, picked):
             return mo.callout(str(error), kind="warn")
         image = mo.Html(draw.image(draw.tracking(data, wide=True), "the picked run"))
         title = mo.md(f"**{number}**: {picked['run']}")
-        return mo.vstack([mo.hstack([title, again], justify="space-between"), image], gap=0.3)
+        return mo.vstack([mo.hstack([title, again], widths=[5, 1]), image], gap=0.3)
 
     _view() if page.value == "Open a study" else None
     return
