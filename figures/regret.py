@@ -156,6 +156,8 @@ def draw(data: xr.Dataset) -> Iterator[Figure]:
             ax.set_xlabel(title)
             if values is not None and _magnitudes(values):
                 ax.set_xscale("log")
+            elif values is not None:
+                ax.xaxis.set_major_locator(MaxNLocator(nbins=4))  # numbers of four digits fit side by side
             if values is None:
                 ax.set_xlim(left=0)
                 ax.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True))
