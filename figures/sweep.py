@@ -7,6 +7,7 @@ and operating regions, ``blocking`` for blocks and horizons, ``fan`` and ``distr
 from __future__ import annotations
 
 import contextlib
+import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -105,7 +106,7 @@ def run(data: xr.Dataset, title: str) -> Iterator[Figure]:
     """The figure of `draw_run`, from results of one controller called ``run``."""
     cvs = panels.cv_names(data)
     with style.figure(len(cvs) + 2, row_height=1.8) as (drawn, axes):
-        drawn.suptitle(title, fontsize=10)
+        drawn.suptitle(textwrap.fill(title, 95), fontsize=10)
         seconds = panels.time_axis(
             axes[-1], float(data.time.values[0]), float(data.time.values[-1]) + data.attrs["dt"]
         )

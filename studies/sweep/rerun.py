@@ -113,8 +113,9 @@ def rerun(store: Path, number: int) -> Rerun:
         noise=scenario.noise,
         seed=scenario.seed,
     )
+    shown = lambda value: f"{value:.6g}" if isinstance(value, float) else value  # noqa: E731
     values = [
-        f"{c.key} = {c.values[number]}{f' {c.unit}' if c.unit not in ('', '1') else ''}"
+        f"{c.key} = {shown(c.values[number])}{f' {c.unit}' if c.unit not in ('', '1') else ''}"
         for c in study.columns
     ]
     title = f"{study.name}, scenario {number}: {', '.join(values)}"
