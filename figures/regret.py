@@ -154,13 +154,13 @@ def draw(data: xr.Dataset) -> Iterator[Figure]:
                         sheet.ring(ax, x[1], y[1], label=None, size=13)
             ax.margins(0.14)
             ax.set_xlabel(title)
-            if values is not None and _magnitudes(values):
-                ax.set_xscale("log")
-            elif values is not None:
-                ax.xaxis.set_major_locator(MaxNLocator(nbins=4))  # numbers of four digits fit side by side
             if values is None:
                 ax.set_xlim(left=0)
                 ax.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True))
+            elif _magnitudes(values):
+                ax.set_xscale("log")
+            else:
+                ax.xaxis.set_major_locator(MaxNLocator(nbins=4))  # numbers of four digits fit side by side
             ax.labels_to_place = (names, places)
         panels[0, 0].set_ylabel(f"closed-loop cost above that of\n{reference} [%]")
         modes = list(dict.fromkeys(variant.mode for variant in variants))

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxmpc import compiled_lists as lists
 from jaxmpc.compiled_lists import STEPS, Listed, LowerBound, Order, Tables, decode, encode, fits, order_of
 from jaxmpc.condense import CondensedQp, QpInstance
-from jaxmpc.gap import SMALLEST, closes
+from jaxmpc.gap import closes, cutoff
 from jaxmpc.relaxation import Solved, map_singly, relax
 from jaxmpc.status import finisher_code
 from jaxmpc.structure import Structure
@@ -136,8 +136,6 @@ def decide_lane(
     model = _lower_model(order, tables, root, predictions, low, high)
     first = jnp.clip(jnp.round(model.center), low, high)
     usable &= fits(order, limits, first[None])[0]
-    least = SMALLEST * tables.scale
-    cutoff = lambda value: value - 0.5 * gap * jnp.maximum(jnp.abs(value), least)  # noqa: E731
 
     def solved(point) -> Solved:
         lower, upper = (v.at[columns].set(point) for v in (instance.lower, instance.upper))
@@ -153,7 +151,7 @@ def decide_lane(
 
     def listed(state: _State, result: Solved) -> _State:
         """The first incumbent is known: what may be better?"""
-        limit = cutoff(state.value)
+        limit = cutoff(state.value, tables.scale, gap)
         away = STEPS - model.center[:, None]
         curved = jnp.where(jnp.isfinite(tables.radius), 0.5 / tables.radius, 0.0)[:, None] * away**2
         alone = model.value + model.excess + curved
@@ -229,7 +227,7 @@ def decide_lane(
         state = jax.lax.cond(state.nodes == 2, listed, lambda state, _: state, state, result)
         state = with_cut(state, cut_of(result, state.point, state.point))
         best = jnp.argmin(state.bounds)
-        going = (state.bounds[best] < cutoff(state.value)) & ~state.given_up
+        going = (state.bounds[best] < cutoff(state.value, tables.scale, gap)) & ~state.given_up
         return state._replace(
             point=jnp.where(going, decode(state.codes[best], len(columns)), state.point),
             expected=state.bounds[best],

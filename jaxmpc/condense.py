@@ -210,6 +210,9 @@ def condense(
     )
 
 
+condensed = eqx.filter_jit(condense)  # one program in place of a hundred operations
+
+
 def _row_unit(row_size, predictions: int):
     """See `CondensedQp`; rows that hardly any move reaches count as longer than they are."""
     longest = jnp.max(row_size)

@@ -14,17 +14,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxmpc import status as codes
 from jaxmpc.blocking import block_members, first_position_rows, hard_rows, moves_per_block, sample_moves
-from jaxmpc.condense import CondensedQp, QpInstance, condense, make_instance
+from jaxmpc.condense import CondensedQp, QpInstance, condensed, make_instance
 from jaxmpc.disturbance import filter_bias
 from jaxmpc.errors import InputError
-from jaxmpc.gap import SMALLEST
+from jaxmpc.gap import relative_gap
 from jaxmpc.newton import WarmStart, warm_start_of
 from jaxmpc.relaxation import cold_start, shifted_start, solve_relaxed
 from jaxmpc.step_response import StepResponseModel, advance_free_response, check_match, shift_free_response
 from jaxmpc.structure import Structure
 from jaxmpc.tuning import Tuning
-
-_condense = eqx.filter_jit(condense)  # one program in place of a hundred operations
 
 
 class ControllerState(eqx.Module):
@@ -198,7 +196,7 @@ class ContinuousController(eqx.Module):
         self.memory = Memory(
             structure, tuning, model.extended(max(structure.prediction_horizon, model.samples))
         )
-        self.qp = _condense(structure, tuning, model.coefficients, envelope=0, summed=summed)
+        self.qp = condensed(structure, tuning, model.coefficients, envelope=0, summed=summed)
 
     @property
     def structure(self) -> Structure:
@@ -245,8 +243,7 @@ class ContinuousController(eqx.Module):
         moves = (solution.x * self.qp.scale).reshape(structure.mv_count, -1).T
         objective = solution.objective
         bound = jnp.minimum(jnp.maximum(solution.bound, 0.0), objective)
-        scale = jnp.maximum(jnp.abs(objective), SMALLEST * jnp.max(jnp.diagonal(self.qp.curvature)))
-        gap = (objective - bound) / scale
+        gap = relative_gap(objective, bound, jnp.max(jnp.diagonal(self.qp.curvature)))
         good = (solution.status == codes.OPTIMAL) & jnp.all(jnp.isfinite(moves)) & jnp.all(jnp.isfinite(cv))
         move = first_move(structure, self.qp.scale, instance, moves[0])
         move = jnp.where(good, move, 0.0)

@@ -4,10 +4,26 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 FINEST = 1e-9  # smallest relative gap that is asked for; round-off is below it
 SMALLEST = 1e-6  # of the problem's scale: objectives below are taken for zero
+
+
+def _module(value: Any) -> Any:
+    return jnp if isinstance(value, jax.Array) else np
+
+
+def reference(value: Any, scale: Any) -> Any:
+    """What gaps are relative to: the objective, or a small share of the problem's scale where that costs next to nothing.
+
+    Args:
+        value: objective, of NumPy or JAX, or a number.
+        scale: of the problem, its largest curvature per move.
+    """
+    return _module(value).maximum(abs(value), SMALLEST * scale)
 
 
 def closes(value: Any, bound: Any, scale: Any, gap: Any) -> Any:
@@ -16,17 +32,19 @@ def closes(value: Any, bound: Any, scale: Any, gap: Any) -> Any:
     Args:
         value: objective of the plan, infinite without one.
         bound: no plan is below.
-        scale: of the problem, its largest curvature per move; gaps of plans that cost next to nothing are relative to a
-            small share of it.
+        scale: see `reference`.
         gap: relative gap; taken as `FINEST` where it is smaller.
     """
-    difference, size, least = value - bound, abs(value), SMALLEST * scale
-    near = (difference <= gap * size) | (difference <= gap * least)
-    near |= (difference <= FINEST * size) | (difference <= FINEST * least)
-    return near & (difference < np.inf)
+    difference, size = value - bound, reference(value, scale)
+    return ((difference <= gap * size) | (difference <= FINEST * size)) & (difference < np.inf)
+
+
+def cutoff(value: Any, scale: Any, gap: Any) -> Any:
+    """Bounds from here on cannot improve on a plan by more than the gap; arguments as for `closes`."""
+    return value - 0.5 * gap * reference(value, scale)
 
 
 def relative_gap(value: Any, bound: Any, scale: Any) -> Any:
     """Gap of plans relative to their objectives, see `closes`; NaN without a plan."""
     with np.errstate(invalid="ignore"):
-        return np.maximum(value - bound, 0.0) / np.maximum(np.abs(value), SMALLEST * scale)
+        return _module(value).maximum(value - bound, 0.0) / reference(value, scale)

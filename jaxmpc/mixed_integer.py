@@ -137,8 +137,7 @@ class MixedIntegerControllers:
             return
         qps, rows, columns = self.constants
         _, _, shapes, _ = jax.eval_shape(observed, self.memory, qps, rows, columns, state, cv, cv)
-        blank = jax.tree.map(lambda v: np.zeros(v.shape, v.dtype), shapes)
-        compile_together(step, lambda: self.solver.relaxer(1).compile(blank, state.warm))
+        compile_together(step, lambda: self.solver.relaxer(1).compile(shapes, state.warm))
 
     def step(
         self,

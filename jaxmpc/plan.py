@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -22,7 +21,7 @@ from jaxmpc.condense import DRIFT, QpInstance, dynamic_matrix, make_instance
 from jaxmpc.constants import Constants
 from jaxmpc.errors import InputError
 from jaxmpc.gap import closes, relative_gap
-from jaxmpc.integer import FINISHES, compiles, continuous_feasible
+from jaxmpc.integer import FINISHES, continuous_feasible
 from jaxmpc.newton import WarmStart
 from jaxmpc.packing import Packing, flattened, rebuilt
 from jaxmpc.relaxation import relax
@@ -31,7 +30,6 @@ from jaxmpc.search import SearchResult
 from jaxmpc.step_response import StepResponseModel, check_match
 from jaxmpc.step_solver import StepSolver
 from jaxmpc.structure import Structure, check_vector
-from jaxmpc.threads import compile_together, cores
 from jaxmpc.tuning import Tuning
 
 
@@ -165,10 +163,7 @@ class Planner:
 
         start = None if warm is None else jax.tree.map(lambda leaf: np.asarray(leaf)[None], warm)
         if self.solver.narrow:
-            searches = bool(self.structure.integer_mvs) and compiles(relaxer, finish, time_limit)
-            begin, instances, root = self._posed(
-                relaxer, sample, recover, relaxer.fitting(start, 1), searches
-            )
+            begin, instances, root = self._posed(relaxer, sample, recover, relaxer.fitting(start, 1))
         else:
             if not self._started:  # compiles; the clock measures solves
                 jax.block_until_ready(instances_of(relaxer))
@@ -192,29 +187,25 @@ class Planner:
         return self._plan(relaxer.scenario(0), instance, result, mv_now, free_response, setpoint, gap, begin)
 
     def _posed(
-        self, relaxer: Relaxer, sample: tuple, recover: bool, start: WarmStart, searches: bool
+        self, relaxer: Relaxer, sample: tuple, recover: bool, start: WarmStart
     ) -> tuple[float, QpInstance, Relaxations]:
-        """When the clock started, the problem for moves of one step, and its relaxation; whether a search may follow."""
+        """When the clock started, the problem for moves of one step, and its relaxation."""
         given = (*(None if v is None else v[None] for v in sample), start)
         of_given = Packing.of(given)
         qp = relaxer.scenario(0).qp
         if self._flat is None:
             self._flat = flattened((self.tuning, qp, relaxer.hard, relaxer.columns))
         leaves, form = self._flat
-        first_calls: list[Callable[[], Any]] = []
         fresh = (recover, of_given) not in self._packings
         if fresh:
             shapes = jax.eval_shape(lambda: _make_instance(self.structure, self.tuning, qp, *sample, recover))
-            if searches and cores() > 2:  # one program keeps two cores busy while it is compiled
-                blank = jax.tree.map(lambda v: np.zeros(v.shape, v.dtype), shapes)
-                first_calls.append(lambda: relaxer.compile(blank, start))
             self._packings[recover, of_given] = Packing.of((shapes, relaxer.solved_shapes))
         packings = of_given, self._packings[recover, of_given]
         call = lambda: np.asarray(  # noqa: E731
             _relax_instance(self.structure, leaves, of_given.pack(given), recover, form, packings)
         )
-        if fresh:  # the clock measures solves
-            compile_together(call, *first_calls)
+        if fresh:
+            call()  # compiles; the clock measures solves
         begin = time.perf_counter() - self.solver.compiling
         instances, root = packings[1].unpack(call())
         return begin, instances, relaxations(root, relaxer.predictions)

@@ -149,7 +149,6 @@ class Relaxer:
         self.hard, self.columns = jnp.asarray(self.rows), jnp.asarray(self.integer)
         self.one = len(constants) == 1
         self.compiling = 0.0  # seconds of first calls so far
-        self._called: set = set()  # keys of forms that need no other look
         rows, n = first.qp.response.shape
         self.sizes = SIZES if n <= WIDE else SIZES[:1]
         self.predictions = rows - len(first.knot)
@@ -168,7 +167,7 @@ class Relaxer:
     def part(self, index: np.ndarray) -> Relaxer:
         """The relaxations of some scenarios; nothing is compiled or computed again."""
         some = copy.copy(self)
-        some.compiling, some._called = 0.0, set()
+        some.compiling = 0.0
         some.__dict__.pop("_flat", None)
         if not self.one:
             some.constants, some.lanes = [self.constants[i] for i in index], self.lanes.take(index)
@@ -244,15 +243,21 @@ class Relaxer:
             lanes[count - begin :] = np.nan  # no root: nothing is searched
             arguments = self.structure, leaves, problems, index[pad], lanes, max(gap, FINEST), form, packings
             call = lambda a=arguments: np.asarray(_decide(*a))  # noqa: E731
-            key = "decide", problems.shape, lanes.shape
-            found = self._timed(key, (self.structure, packings, form), call)
+            what = "decide", self.structure, problems.shape, lanes.shape, packings, form
+            found = self._timed(what, call)
             parts.append(found[: count - begin])
             begin += size
         found = parts[0] if len(parts) == 1 else np.concatenate(parts)
         return self.of_decision.unpack(found)
 
-    def compile(self, instances: QpInstance, warm: WarmStart) -> None:
-        """Compile what nearly every search calls: the compiled search, or relaxations in batches of a few sizes."""
+    def compile(self, shapes: QpInstance, warm: WarmStart) -> None:
+        """Compile what nearly every search calls: the compiled search, or relaxations in batches of a few sizes.
+
+        Args:
+            shapes: problems of all scenarios, or the shapes of their arrays.
+            warm: where relaxations start.
+        """
+        instances = jax.tree.map(lambda v: np.zeros(v.shape, v.dtype), shapes)
         lower, upper = np.asarray(instances.lower), np.asarray(instances.upper)
         if self.tables is not None:
             blank = jax.tree.map(lambda v: np.zeros((len(lower), *v.shape[1:]), v.dtype), self.solved_shapes)
@@ -289,21 +294,13 @@ class Relaxer:
         """Call the relaxation; compilation is not held against a time limit."""
         (leaves, form), packings = self._flat, (of_instances, self.of_lanes, self.of_solved)
         call = lambda: np.asarray(_relax(leaves, problems, index, lanes, form, packings))  # noqa: E731
-        return self._timed(("relax", problems.shape, lanes.shape), (packings, form), call)
+        return self._timed((problems.shape, lanes.shape, packings, form), call)
 
-    def _timed(self, key, form, call):
-        """The result of a compiled call; what a first call of its form takes is counted as compilation.
-
-        Args:
-            key: of the form among those of this relaxer.
-            form: what else is compiled for.
-            call: of the program.
-        """
-        if key not in self._called:
-            if (key, form) not in _COMPILED:
-                begin = time.perf_counter()
-                call()
-                _COMPILED.add((key, form))
-                self.compiling += time.perf_counter() - begin
-            self._called.add(key)
+    def _timed(self, what, call):
+        """The result of a compiled call; what a first call of its kind takes is counted as compilation."""
+        if what not in _COMPILED:
+            begin = time.perf_counter()
+            call()
+            _COMPILED.add(what)
+            self.compiling += time.perf_counter() - begin
         return call()

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxmpc.condense import QpInstance
 from jaxmpc.constants import Constants
-from jaxmpc.gap import FINEST, SMALLEST, closes
+from jaxmpc.gap import FINEST, closes, cutoff, reference
 from jaxmpc.levelset import LowerModel
 from jaxmpc.newton import WarmStart
 from jaxmpc.propagation import Chain, chains_of, nearest, satisfied
@@ -95,12 +95,12 @@ class Search:
     @property
     def cutoff(self) -> float:
         """Bounds from here on cannot improve the incumbent by more than the gap."""
-        return self.value - 0.5 * self.gap * self.reference if np.isfinite(self.value) else np.inf
+        return cutoff(self.value, self.constants.scale, self.gap) if np.isfinite(self.value) else np.inf
 
     @property
     def reference(self) -> float:
-        """What gaps are relative to: the incumbent's value, or a small share of the problem's scale if that is zero."""
-        return max(abs(self.value), SMALLEST * self.constants.scale)
+        """What gaps of the incumbent are relative to."""
+        return reference(self.value, self.constants.scale)
 
     def out_of_time(self) -> bool:
         """Whether the time limit is used up."""

@@ -14,7 +14,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxmpc.condense import DRIFT, CondensedQp, QpInstance, condense, integer_columns
+from jaxmpc.condense import DRIFT, CondensedQp, QpInstance, condensed, integer_columns
 from jaxmpc.constants import Constants
 from jaxmpc.errors import InputError
 from jaxmpc.integer import solve_integers
@@ -28,7 +28,6 @@ from jaxmpc.tuning import Tuning
 
 WIDEST_ENVELOPE = 4  # steps up to which the envelope of the squared integer move is built
 
-_condense = eqx.filter_jit(condense)
 InstancesOf = Callable[[Relaxer], QpInstance]
 
 
@@ -72,7 +71,7 @@ class StepSolver:
         return some
 
     def _qp(self, tuning: Tuning, model: StepResponseModel, envelope: int) -> CondensedQp:
-        return _condense(
+        return condensed(
             self.structure, tuning, model.coefficients, envelope=envelope, has_limits=self.has_limits
         )
 

@@ -30,7 +30,7 @@ from jaxmpc.mixed_integer import MixedIntegerControllers, observed, remembered
 from jaxmpc.packing import Packing, flattened, rebuilt
 from jaxmpc.plant import WellPlant, WellState
 from jaxmpc.relaxation import Solved
-from jaxmpc.relaxer import Relaxations, relaxations
+from jaxmpc.relaxer import relaxations
 from jaxmpc.structure import Structure
 from jaxmpc.threads import compile_together, parts_of, side_by_side
 
@@ -243,37 +243,22 @@ class _Run:
         return _Stage(packed, bool(decided)), rows(seen), rows(done), int(count)
 
     def decide(self, stage: _Stage, fields: dict[str, np.ndarray], at: int) -> _Stage:
-        """Decide sample `at`, alone or on the host, and record how."""
+        """Decide sample `at` outside the stride, and record how."""
         begin = time.perf_counter()
         sample: Sample = self.of_sample.unpack(np.array(stage.packed))
-        root = relaxations(sample.root, self.narrow.predictions)
-        if self.count == 1 and np.isfinite(sample.cv).all():
-            found = self.narrow.decide(sample.instance, np.zeros(1, dtype=int), root, self.controllers.gap)
-            if found.closed[0]:
-                done = sample._replace(x=found.x, good=found.closed, decided=found.closed)
-                stage = _Stage(self.of_sample.pack(done), True)
-                for name in ("bound", "nodes", "finished_by"):
-                    fields[name][0, at] = getattr(found, name)[0]
-                fields["objective"][0, at] = found.value[0]
-                fields["solve_time"][0, at] += time.perf_counter() - begin
-                return stage
-        return self._on_host(sample, root, fields, at, time.perf_counter() - begin)
-
-    def _on_host(
-        self, sample: Sample, root: Relaxations, fields: dict[str, np.ndarray], at: int, seconds: float
-    ) -> _Stage:
         c = self.controllers
         which = np.flatnonzero(~sample.decided)
         starts = c.solver.starts(self.narrow, np.asarray(sample.state.plan))
+        seconds = (time.perf_counter() - begin) / len(which)
         results, _ = solve_integers(
             self.narrow,
             sample.instance,
             starts=starts,
-            root=root,
+            root=relaxations(sample.root, self.narrow.predictions),
             gap=c.gap,
             time_limit=c.time_limit,
             which=which,
-            searched=True,
+            searched=self.count > 1,
         )
         x, good = sample.x.copy(), sample.good.copy()
         for i, result in zip(which, results, strict=True):

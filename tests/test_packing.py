@@ -47,7 +47,7 @@ def test_a_module_taken_apart_is_the_same_module_and_its_form_a_static_argument(
     each = WarmStart(*(np.full(n, 1.0) for n in (4, 7, 6, 4, 2)))
     other = jax.tree.map(lambda v: 2.0 * v, each)
     (leaves, form), (others, same) = (flattened(Lanes(own, (None, "shared"))) for own in (each, other))
-    assert form == same
+    assert form == same  # arrays are not part of it
     assert hash(form) == hash(same)
     assert_same(rebuilt(form, leaves).each, each)
     assert_same(rebuilt(form, others).each, other)
