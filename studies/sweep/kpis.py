@@ -101,8 +101,8 @@ KPIS: tuple[Kpi, ...] = (
         "mv_violations", "samples with the MV outside its limits", "samples", "count_k(x[k] > 1e-6 width)", MV
     ),
     Kpi("mv_largest_excess", "largest excess of the MV over its limits", "mv_unit", "max_k x[k]", MV),
-    Kpi("choke_travel", "sum of absolute choke moves, actual position", "%", "sum_k |m[k]|"),
-    Kpi("choke_moves", "choke moves", "1", "count_k(|m[k]| > 0.05 %)"),
+    Kpi("choke_travel", "sum of absolute choke moves, actual position", "%", "sum_k abs(m[k])"),
+    Kpi("choke_moves", "choke moves", "1", "count_k(abs(m[k]) > 0.05 %)"),
     Kpi("choke_reversals", "choke moves against the move before", "1", "count_n(m[n] m[n-1] < 0)"),
     Kpi(
         "hunting_reversals",
@@ -112,7 +112,7 @@ KPIS: tuple[Kpi, ...] = (
     ),
     Kpi("mean_dwell", "mean time between successive choke moves", "s", "mean_n(t[n] - t[n-1])"),
     Kpi("shortest_dwell", "shortest time between successive choke moves", "s", "min_n(t[n] - t[n-1])"),
-    Kpi("lift_travel", "sum of absolute moves of the lift", "m3/h", "sum_k |m[k]|"),
+    Kpi("lift_travel", "sum of absolute moves of the lift", "m3/h", "sum_k abs(m[k])"),
     Kpi("lift_volume", "lift gas asked for", "m3", "dt / 3600 sum_k u[k]"),
     Kpi("oil_produced", "oil produced", "m3", "dt / 3600 sum_k y[k]"),
     Kpi("gas_produced", "gas produced, lift gas included", "m3", "dt / 3600 sum_k y[k]"),
