@@ -152,6 +152,7 @@ def test_a_plan_is_judged_against_the_best_feasible_one():
 # ------------------------------------------------------------------------------------------------- recordings
 
 
+@pytest.mark.slow
 def test_a_replayed_sample_is_the_problem_that_the_controller_solved(model, reference, cache):
     recordings = Recordings(model, reference, 20)
     recording = recordings.live("mixed-integer", MODE)
@@ -246,6 +247,7 @@ def test_exact_rows_are_judged_beside_a_peer_that_cannot_be_used(cache):
     assert found["jaxmpc"].goals[2].met(found["jaxmpc"]) is None  # nobody to be faster than
 
 
+@pytest.mark.slow
 def test_batches_have_rates_and_figures(cache, tmp_path):
     report = measure("batch,growth")
     assert [row.section for row in report.rows] == ["batch", "batch", "growth"]

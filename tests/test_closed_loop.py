@@ -126,6 +126,7 @@ def test_a_batch_of_loops_is_each_loop_alone(lanes):
     assert not np.allclose(together[0].mv, together[2].mv, atol=0.1)
 
 
+@pytest.mark.slow
 def test_wells_may_have_lanes_and_controllers_none(lanes):
     indices = jnp.asarray([0.95, 1.0, 1.05])
     wells = eqx.filter_vmap(
@@ -187,6 +188,7 @@ def test_noise_has_the_deviation_that_was_asked_for(lanes):
     np.testing.assert_array_equal(later, several[1][10:12])
 
 
+@pytest.mark.slow
 def test_only_what_is_recorded_is_kept(lanes):
     (batch,) = simulate_batches(lanes, WellPlant(), TO_30_PERCENT, samples=5, record=("cv", "solve_time"))
     assert set(batch.fields) == {"cv", "solve_time"}

@@ -166,6 +166,7 @@ def test_an_mv_outside_its_limits_is_brought_back(
     assert float(state.mv[1]) <= 10000.0
 
 
+@pytest.mark.slow
 def test_a_batch_of_controllers_does_what_each_does_alone(well_like_model, small_structure, thesis_fields):
     relaxed = small_structure.relaxed()
     weights = jnp.asarray([[250.0, 0.2], [1.0, 0.02], [0.0, 0.0]])

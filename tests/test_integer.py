@@ -239,6 +239,7 @@ def test_a_list_that_does_not_fit_is_not_claimed_to_be_done(searched, problems, 
             assert float(found.value) == pytest.approx(problem[3].min(), rel=1e-6, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_batch_of_compiled_searches_in_lockstep_is_each_alone(small_structure, searched, problems):
     """What an accelerator runs for scenarios of one controller."""
     constants = problems[0][0]

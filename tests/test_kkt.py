@@ -143,6 +143,7 @@ def test_solved_problems_with_every_twist_have_small_residuals(shape):
         assert worst.max() <= 1e-6, (name, names[int(worst.argmax())], worst.max())
 
 
+@pytest.mark.slow
 def test_a_batch_of_residuals_is_each_alone():
     bodies = [problems.small_case(np.random.default_rng(seed), **SHAPES["moves"]) for seed in range(4)]
     qps, rows, instances = stacked(bodies)

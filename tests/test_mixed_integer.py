@@ -39,6 +39,7 @@ def loop(controller, setpoints, *, together):
     return jax.tree.map(lambda *leaves: np.stack(leaves), *infos)
 
 
+@pytest.mark.slow
 def test_each_of_several_tunings_does_what_it_does_alone(well_like_model, small_structure, thesis_fields):
     tunings = tunings_of(small_structure, thesis_fields)
     setpoints = START[0] + np.array([[900.0, 6.0], [-700.0, -4.0], [300.0, 3.0]])
@@ -56,6 +57,7 @@ def test_each_of_several_tunings_does_what_it_does_alone(well_like_model, small_
     assert len({tuple(together.mv[:, i, 0]) for i in range(3)}) > 1
 
 
+@pytest.mark.slow
 def test_each_of_several_models_does_what_it_does_alone(well_like_model, small_structure, small_tuning):
     models = [
         dataclasses.replace(well_like_model, coefficients=factor * well_like_model.coefficients)
@@ -90,6 +92,7 @@ def test_a_scenario_without_a_measurement_holds_its_mvs_and_leaves_the_others_al
     assert np.isfinite(info.objective[1])
 
 
+@pytest.mark.slow
 def test_time_is_charged_to_the_scenario_that_needs_it(well_like_model, small_structure, small_tuning):
     controllers = MixedIntegerControllers(
         small_structure, [small_tuning], [well_like_model], count=3, time_limit=0.0, finish="branch-and-bound"

@@ -149,6 +149,7 @@ def assert_optimal(shape: dict, seed: int, twists: tuple[str, ...]) -> None:
     assert oracles.complaints(body, solve(body), reference) == [], json.dumps(body)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("twists", TWISTS_PER_SHAPE)
 def test_steps_of_an_unusual_shape_are_optimal(twists):
     """A short model, a late first penalty, moves beyond the prediction, three CVs, all MVs integer."""
@@ -255,6 +256,7 @@ def reordered(body: dict, cv_unit, mv_unit) -> dict:
     return new
 
 
+@pytest.mark.slow
 def test_neither_order_nor_units_of_the_variables_change_the_plan():
     for seed in range(6):
         body = twisted(seed, SMALL["moves"], *(["active_cv_limits"] if seed % 2 else []))

@@ -158,6 +158,7 @@ def mixed_solved(mixed):
     return jax.jit(jax.vmap(lambda i: solve_relaxed(qp, rows, i, i.lower, i.upper)))(lanes)
 
 
+@pytest.mark.slow
 def test_a_lane_of_a_large_batch_does_not_depend_on_its_neighbours(mixed, mixed_solved):
     _, qp, rows, lanes = mixed
     impossible = np.isin(np.arange(MIXED), [NOT_A_NUMBER, CROSSED, CONFLICT])
@@ -216,6 +217,7 @@ def test_lanes_may_have_their_own_limits_inside_a_batch_of_problems(mixed):
         np.testing.assert_allclose(table[lane], values, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_lanes_with_models_of_their_own_are_each_solved_with_its_model(batch, thesis_fields, well_like_model):
     """Per-lane dynamic matrices: alone, and as a batch of models that each serve a batch of problems."""
     structure, _, rows, instances = batch

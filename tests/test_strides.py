@@ -84,6 +84,7 @@ def test_a_controller_whose_finish_is_prescribed_is_stepped(monkeypatch, model):
     assert (run.status == status.OPTIMAL).all()
 
 
+@pytest.mark.slow
 def test_many_loops_do_not_depend_on_how_many_threads_and_parts_there_are(monkeypatch, model):
     """Three parts of two, the last filled up, by one thread and by three; and each loop alone."""
     structure = presets.structure("moves", integer=True)

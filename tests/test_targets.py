@@ -164,6 +164,7 @@ def test_no_targets_leave_the_problem_as_it_is(well_like_model, small_structure,
     assert np.array_equal(info.move, plain.move)
 
 
+@pytest.mark.slow
 def test_a_target_for_one_mv_alone_adds_one_cv(well_like_model, small_structure, small_tuning):
     structure, tuning, model = augment(small_structure, small_tuning, well_like_model, {"lift": 0.5})
     assert structure.cv_names == model.cv_names == ("gas", "oil", "lift.target")
