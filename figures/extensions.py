@@ -195,6 +195,7 @@ def _gap_strips(axes: Axes, data: xr.Dataset, names: Sequence[str]) -> None:
             axes.hlines(np.median(gap), i - 0.35, i + 0.35, color=style.BLACK, linewidth=2.0)
     axes.set_yscale("log")
     axes.set_xticks(np.arange(len(names)), words)
+    axes.set_xlim(-0.5, len(names) - 0.5)  # the last limits may stop no step
     axes.set_ylabel("proven gap of limited steps [%]")
     axes.set_xlabel("time limit of a step (share that reaches it)")
     axes.grid(axis="x", visible=False)
