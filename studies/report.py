@@ -111,7 +111,8 @@ def limits_markdown(rows: list[LimitedSteps]) -> str:
         "|---|---|---|---|",
     ]
     for row in rows:
-        lost = " / ".join(f"{100 * value:.2g}" for value in row.lost)
+        # the optimum itself is known to a relative gap of 1e-6
+        lost = " / ".join("0" if value <= 1e-6 else f"{100 * value:.2g}" for value in row.lost)
         known = f"{100 * row.gap:.2g} % | {lost} %" if row.share > 0 else " | "
         lines.append(f"| {row.label} | {100 * row.share:.1f} % | {known} |")
     return "\n".join([*lines, ""])
