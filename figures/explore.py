@@ -323,6 +323,8 @@ def _legend(figure: Figure, axes: np.ndarray) -> None:
     for ax in axes.flat:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             found.setdefault("deadzone" if label.startswith("deadzone") else label, handle)
+    if "demanded and actual" in found:  # of the MVs without a demand of their own
+        found.pop("actual", None)
     figure.legend(list(found.values()), list(found), loc="upper center", ncols=len(found), borderaxespad=0.2)
 
 

@@ -59,6 +59,7 @@ RC: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
+    "axes.formatter.useoffset": False,  # a value that hardly changes is written in full
     "axes.axisbelow": True,
     "grid.color": "#EBEBEB",
     "grid.linewidth": 0.7,
