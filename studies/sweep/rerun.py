@@ -113,7 +113,7 @@ def rerun(store: Path, number: int) -> Rerun:
         noise=scenario.noise,
         seed=scenario.seed,
     )
-    shown = lambda value: f"{value:.6g}" if isinstance(value, float) else value  # noqa: E731
+    shown = lambda value: f"{value:g}" if isinstance(value, float) else value  # noqa: E731
     values = [
         f"{c.key} = {shown(c.values[number])}{f' {c.unit}' if c.unit not in ('', '1') else ''}"
         for c in study.columns
