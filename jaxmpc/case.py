@@ -22,6 +22,7 @@ import numpy as np
 from jaxmpc.condense import DRIFT
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
+from jaxmpc.gap import check_gap, check_time_limit
 from jaxmpc.step_response import StepResponseModel, make_model
 from jaxmpc.structure import Structure
 from jaxmpc.tuning import UNITS, Tuning, make_tuning
@@ -391,11 +392,10 @@ def _finite(path: str, array: np.ndarray) -> np.ndarray:
 
 
 def _limits(fields: _LimitFields) -> dict[str, Any]:
-    if fields.time_s is not None and not (math.isfinite(fields.time_s) and fields.time_s >= 0):
-        raise InputError("limits.time_s", fields.time_s, "a finite time, 0 or more [s], or null for no limit")
-    if not 0 <= fields.gap <= 1:
-        raise InputError("limits.gap", fields.gap, "a relative gap from 0 to 1")
-    return {"time_limit": fields.time_s, "gap": fields.gap}
+    return {
+        "time_limit": check_time_limit("limits.time_s", fields.time_s),
+        "gap": check_gap("limits.gap", fields.gap),
+    }
 
 
 def _check_position(case: Case) -> None:

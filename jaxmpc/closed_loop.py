@@ -14,6 +14,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.batch import Lanes, for_all, place, variant_mesh
@@ -22,13 +23,14 @@ from jaxmpc.controller import ContinuousController, ControllerState
 from jaxmpc.errors import InputError
 from jaxmpc.host_well import HostWell
 from jaxmpc.interventions import CarriedOut, checked_changes, checked_sample, handed_over
+from jaxmpc.measurement import received
 from jaxmpc.mixed_integer import MixedIntegerController, MixedIntegerControllers
 from jaxmpc.noise import check_deviation, check_seed, noise_samples
 from jaxmpc.plant import WellPlant
 from jaxmpc.reference import Reference
 from jaxmpc.strides import able, simulate_in_strides
 from jaxmpc.structure import Structure
-from jaxmpc.sweep import Sweep, check_match, check_offsets, sampled
+from jaxmpc.sweep import Sweep, check_faults, check_match, check_offsets, sampled
 from jaxmpc.together import advance_together, errors_of
 from jaxmpc.trajectory import RECORDABLE, Trajectory, TrajectoryBatch
 
@@ -45,6 +47,8 @@ def simulate(
     disturbance=None,
     noise=None,
     seed: int = 0,
+    faults=None,
+    position_feedback: bool = False,
     changes: Sequence[tuple[float, ContinuousController | MixedIntegerController]] = (),
     open_loop_from: float | None = None,
     keep_plans: bool = False,
@@ -60,6 +64,8 @@ def simulate(
         disturbance: reservoir-pressure offset per sample [bar], ``"sample"``; none if not given.
         noise: standard deviation of the measurement noise, ``"cv"`` [CV unit]; none if not given.
         seed: of the noise.
+        faults: errors of failing sensors ``"sample cv"``, from `measurement.fault_errors`; none if not given.
+        position_feedback: whether the controller is told where the actuators stand, and predicts from there.
         changes: times [s] and controllers of equal structure that take over then, with the state of the one before.
         open_loop_from: from the plan made at this time [s] on, no measurement is used and nothing is solved: the plan is
             carried out to its end, then the MVs are held. Status, bias and objective stay those of the plan.
@@ -67,11 +73,12 @@ def simulate(
         progress: called with ``(done, total)`` samples.
 
     Returns:
-        `Trajectory`; its CVs are what was measured, noise included.
+        `Trajectory`; its CVs are what sensors without fault measure, noise included.
 
     Raises:
         InputError: if sampling intervals differ, the reference has other CVs or ends before the run, the disturbance
-            has not one finite value per sample, the noise not one standard deviation per CV, or a change does not fit.
+            has not one finite value per sample, the noise not one standard deviation per CV, the faults not one error per
+            sample and CV, or a change does not fit.
     """
     structure = controller.structure
     check_match(structure, plant)
@@ -84,7 +91,9 @@ def simulate(
     errors = np.zeros((len(setpoints), structure.cv_count))
     if deviation.any():
         errors = np.asarray(_noise(deviation, stream, 0, np.arange(len(setpoints))))
-    inputs = setpoints, offsets, errors
+    failing = np.zeros_like(setpoints) if faults is None else np.asarray(faults, dtype=np.float64)
+    check_faults(failing, setpoints.shape)
+    inputs, told = (setpoints, offsets, errors, failing), position_feedback
     takeovers, blind = checked_changes(controller, changes, len(setpoints)), None
     if open_loop_from is not None:
         blind = checked_sample("open_loop_from", open_loop_from, structure, len(setpoints))
@@ -92,11 +101,11 @@ def simulate(
             raise InputError("open_loop_from", open_loop_from, "a time after the last of changes")
     plain = isinstance(plant, WellPlant) and not takeovers and blind is None
     if plain and isinstance(controller, ContinuousController):
-        record = _simulate_compiled(controller, plant, inputs, progress, keep_plans)
+        record = _simulate_compiled(controller, plant, inputs, told, progress, keep_plans)
     elif plain and isinstance(controller, MixedIntegerController) and able(controller.together):
-        record = _simulate_in_strides(controller.together, plant, inputs, progress)
+        record = _simulate_in_strides(controller.together, plant, inputs, told, progress)
     else:
-        record = _simulate_on_host(controller, plant, inputs, progress, takeovers, blind)
+        record = _simulate_on_host(controller, plant, inputs, told, progress, takeovers, blind)
     if not keep_plans:
         record.pop("plan", None)
     return Trajectory(setpoint=setpoints, **record, **_labels(structure, len(setpoints)))
@@ -123,7 +132,7 @@ def _labels(structure: Structure, samples: int) -> dict[str, Any]:
 _run_chunk: Any = eqx.filter_jit(scan)
 
 
-def _simulate_compiled(controller, plant, inputs, progress: Progress | None, keep_plans: bool):
+def _simulate_compiled(controller, plant, inputs, told: bool, progress: Progress | None, keep_plans: bool):
     recorded = (*RECORDABLE, "plan") if keep_plans else RECORDABLE
     carry = start(controller, plant)
     total, parts = len(inputs[0]), []
@@ -132,10 +141,12 @@ def _simulate_compiled(controller, plant, inputs, progress: Progress | None, kee
         now = jax.tree.map(lambda leaf, at=begin: leaf[at : at + CHUNK], inputs)
         count = len(now[0])
         if count not in ready:  # compile before the clock starts
-            _run_chunk.lower(controller, plant, carry, now, recorded).compile()
+            _run_chunk.lower(controller, plant, carry, now, jnp.asarray(told), recorded).compile()
             ready.add(count)
         started = time.perf_counter()
-        carry, record = jax.block_until_ready(_run_chunk(controller, plant, carry, now, recorded))
+        carry, record = jax.block_until_ready(
+            _run_chunk(controller, plant, carry, now, jnp.asarray(told), recorded)
+        )
         # a compiled loop has no clock: every sample of a chunk gets the chunk's mean, plant included
         mean = (time.perf_counter() - started) / count
         parts.append(jax.tree.map(np.asarray, record) | {"solve_time": np.full(count, mean)})
@@ -144,7 +155,9 @@ def _simulate_compiled(controller, plant, inputs, progress: Progress | None, kee
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
-def _simulate_in_strides(controllers: MixedIntegerControllers, plant, inputs, progress: Progress | None):
+def _simulate_in_strides(
+    controllers: MixedIntegerControllers, plant, inputs, told: bool, progress: Progress | None
+):
     """A single mixed-integer controller."""
     done, total = 0, len(inputs[0])
 
@@ -154,21 +167,19 @@ def _simulate_in_strides(controllers: MixedIntegerControllers, plant, inputs, pr
         if progress is not None and done:
             progress(done, total)
 
-    setpoints, offsets, errors = (v[None] for v in inputs)
-    fields = simulate_in_strides(controllers, for_all(plant), (setpoints, offsets, errors), tick)
+    fields = simulate_in_strides(
+        controllers, for_all(plant), tuple(v[None] for v in inputs), np.array([told]), tick
+    )
     return {name: values[0] for name, values in fields.items()}
 
 
 # ------------------------------------------------------------------------------------------------- on the host
 
 
-_jitted_step: Any = eqx.filter_jit(lambda controller, *arguments: controller.step(*arguments))
-
-
 def _simulate_on_host(
-    controller, plant, inputs, progress: Progress | None, takeovers: dict, blind: int | None
+    controller, plant, inputs, told: bool, progress: Progress | None, takeovers: dict, blind: int | None
 ):
-    setpoints, offsets, errors = inputs
+    setpoints, offsets, errors, faults = inputs
     host = HostWell(plant) if isinstance(plant, WellPlant) else plant
     outputs = host.init()
     now = np.asarray(outputs.cv)
@@ -185,7 +196,8 @@ def _simulate_on_host(
             if k in takeovers:
                 stepper, state = steppers[k], handed_over(state, states[k])
             if carried is None or blind is None:
-                state, record = stepper.step(state, cv, setpoints[k])
+                mv = np.asarray(outputs.mv) if told else None
+                state, record = stepper.step(state, cv, faults[k], setpoints[k], mv)
                 carried = CarriedOut(controller.structure, record) if k == blind else None
             else:
                 record = carried.record(k - blind, cv)
@@ -216,11 +228,12 @@ class _Compiled:
         self.controller, self.init = controller, controller.init
 
     def prepare(self, state, cv) -> None:
-        jax.block_until_ready(_jitted_step(self.controller, state, cv, cv))
+        jax.block_until_ready(self.controller.step(state, cv, cv))
 
-    def step(self, state, cv, setpoint):
+    def step(self, state, cv, fault, setpoint, mv):
+        arrived = received(cv, fault, np.asarray(state.sensors.value))
         begin = time.perf_counter()
-        state, info = jax.block_until_ready(_jitted_step(self.controller, state, cv, setpoint))
+        state, info = jax.block_until_ready(self.controller.step(state, arrived, setpoint, mv))
         record = record_of(cv, info.mv, state, info) | {"solve_time": time.perf_counter() - begin}
         return state, {name: np.asarray(value) for name, value in record.items()}
 
@@ -234,8 +247,10 @@ class _BatchOfOne:
     def init(self, cv, mv) -> ControllerState:
         return self.controllers.init(cv[None], mv[None])
 
-    def step(self, state, cv, setpoint):
-        state, info = self.controllers.step(state, cv[None], setpoint[None])
+    def step(self, state, cv, fault, setpoint, mv):
+        arrived = received(cv[None], fault[None], np.asarray(state.sensors.value))
+        position = None if mv is None else mv[None]
+        state, info = self.controllers.step(state, arrived, setpoint[None], position)
         record = record_of(cv[None], info.mv, state, info) | {"solve_time": info.solve_time}
         return state, {name: value[0] for name, value in record.items()}
 
@@ -260,6 +275,8 @@ def simulate_batches(
     disturbance=None,
     noise=None,
     seed=0,
+    faults=None,
+    position_feedback: Any = False,
     record: Sequence[str] = RECORDABLE,
     lanes_at_once: int = LANES,
     devices: Sequence[Any] | None = None,
@@ -281,6 +298,10 @@ def simulate_batches(
         noise: standard deviation of the measurement noise [CV unit], ``"cv"`` or ``"lane cv"``; none if not given.
         seed: of the noise. One number gives every lane noise of its own. With one number per lane, lanes with equal
             seeds get equal noise, which is that of `simulate` with this seed.
+        faults: errors of failing sensors ``"sample cv"`` or ``"lane sample cv"``, from `measurement.fault_errors`; none if
+            not given.
+        position_feedback: whether the controllers are told where the actuators stand, and predict from there; one for
+            all or ``"lane"``.
         record: names of the fields of `Trajectory` to keep; the others are never stored.
         lanes_at_once: lanes of one piece; fewer where the lanes then divide evenly. Each size compiles once.
         devices: to spread the lanes over; all of this process if not given.
@@ -292,7 +313,9 @@ def simulate_batches(
     Raises:
         InputError: at once, for what `simulate` refuses, lane counts that differ, or no lanes at all.
     """
-    sweep = Sweep.checked(controllers, plants, reference, samples, disturbance, noise, seed)
+    sweep = Sweep.checked(
+        controllers, plants, reference, samples, disturbance, noise, seed, faults, position_feedback
+    )
     unknown = [field for field in record if field not in RECORDABLE]
     if unknown:
         raise InputError("record", unknown[0], f"some of {', '.join(RECORDABLE)}")
@@ -312,12 +335,16 @@ def _pieces(sweep: Sweep, record, lanes_at_once: int, mesh, progress) -> Iterato
 
     if isinstance(sweep.controllers, MixedIntegerControllers):
         everyone = np.arange(sweep.count)
-        inputs = sweep.setpoints_of(everyone), sweep.offsets_of(everyone)
-        noise = sweep.deviation, sweep.seeds
-
+        errors = errors_of(sweep.deviation, sweep.seeds, np.arange(sweep.samples))
+        inputs = (
+            sweep.setpoints_of(everyone),
+            sweep.offsets_of(everyone),
+            errors,
+            sweep.faults_of(everyone),
+        )
+        told = sweep.position_feedback
         if able(sweep.controllers):
-            errors = errors_of(sweep.deviation, sweep.seeds, np.arange(sweep.samples))
-            together = simulate_in_strides(sweep.controllers, sweep.plants, (*inputs, errors), tick)
+            together = simulate_in_strides(sweep.controllers, sweep.plants, inputs, told, tick)
             yield TrajectoryBatch(
                 lanes=everyone,
                 setpoint=inputs[0],
@@ -333,7 +360,7 @@ def _pieces(sweep: Sweep, record, lanes_at_once: int, mesh, progress) -> Iterato
         yield TrajectoryBatch(
             lanes=everyone,
             setpoint=inputs[0],
-            fields=advance_together(sweep.controllers, sweep.plants, inputs, noise, keep, tick),
+            fields=advance_together(sweep.controllers, sweep.plants, inputs, told, keep, tick),
             **_labels(sweep.structure, sweep.samples),
         )
         return

@@ -13,9 +13,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool
 
 from jaxmpc.batch import Lanes, for_all, map_lanes, per_lane, place
 from jaxmpc.controller import ContinuousController, ControllerState, StepInfo
+from jaxmpc.measurement import received
 from jaxmpc.noise import noise_samples
 from jaxmpc.plant import WellPlant
 from jaxmpc.sweep import Sweep
@@ -36,6 +38,8 @@ def record_of(cv, mv, state: ControllerState, info: StepInfo) -> dict[str, Any]:
         plan=info.moves,
         bias=state.bias,
         bias_raw=state.bias_raw,
+        quality=state.sensors.quality,
+        off=state.sensors.off,
         status=info.status,
         fallback=info.fallback,
         objective=info.objective,
@@ -50,20 +54,38 @@ def start(controller: ContinuousController, plant: WellPlant):
     """States of controller and plant at the plant's steady state, and what it measures there."""
     plant_state = plant.init()
     outputs = plant.measure(plant_state)
-    return controller.init(outputs.cv, outputs.mv), plant_state, outputs.cv
+    return controller.init(outputs.cv, outputs.mv), plant_state, outputs.cv, outputs.mv
 
 
-def scan(controller: ContinuousController, plant: WellPlant, carry, inputs, recorded=RECORDABLE):
-    """Some samples of a compiled loop: measure, decide, advance the plant."""
+def scan(
+    controller: ContinuousController,
+    plant: WellPlant,
+    carry,
+    inputs,
+    told: Bool[Array, ""],
+    recorded=RECORDABLE,
+):
+    """Some samples of a compiled loop: measure, decide, advance the plant.
+
+    Args:
+        controller, plant: of one lane.
+        carry: from `start` or the samples before.
+        inputs: setpoints, pressure offsets, noise and faults of the sensors, ``"sample ..."``.
+        told: whether the controller is told where the actuators stand.
+        recorded: fields to keep.
+    """
 
     def one(carry, inputs):
-        state, plant_state, cv = carry
-        setpoint, offset, error = inputs
-        measured = cv + error
-        state, info = controller.step(state, measured, setpoint)
+        state, plant_state, cv, mv = carry
+        setpoint, offset, error, fault = inputs
+        sound = cv + error
+        arrived = received(sound, fault, state.sensors.value)
+        state, info = controller.step(state, arrived, setpoint, jnp.where(told, mv, jnp.nan))
         plant_state, outputs = plant.step(plant_state, state.mv, offset)
-        record = record_of(measured, outputs.mv, state, info)
-        return (state, plant_state, outputs.cv), {k: v for k, v in record.items() if k in recorded}
+        record = record_of(sound, outputs.mv, state, info)
+        return (state, plant_state, outputs.cv, outputs.mv), {
+            k: v for k, v in record.items() if k in recorded
+        }
 
     return jax.lax.scan(one, carry, inputs)
 
@@ -117,15 +139,17 @@ class _Part:
         self.loop = [self.put(Lanes(each, shared)) for each, shared in zip(own, common, strict=True)]
         self.noise = [self.put(per_lane(v[index])) for v in (sweep.seeds, sweep.deviation)]
         self.setpoints, self.offsets = sweep.setpoints_of(index), sweep.offsets_of(index)
+        self.faults = sweep.faults_of(index)
+        self.told = self.put(per_lane(jnp.asarray(sweep.position_feedback[index])))
         self.samples, self.lanes, self.record, self.mesh = sweep.samples, len(index), record, mesh
         self.length = even(sweep.samples, CHUNK)
 
     def _arguments(self, carry, begin: int):
         # samples beyond the end are simulated and dropped, for the sake of one shape
         now = np.minimum(np.arange(begin, begin + self.length), self.samples - 1)
-        inputs = self.put(per_lane((self.setpoints[:, now], self.offsets[:, now])))
+        inputs = self.put(per_lane((self.setpoints[:, now], self.offsets[:, now], self.faults[:, now])))
         which = self.put(for_all(jnp.asarray(begin)))
-        return [*self.loop, per_lane(carry), inputs, *self.noise, which, for_all(self.record)]
+        return [*self.loop, per_lane(carry), inputs, *self.noise, which, self.told, for_all(self.record)]
 
     def compile(self) -> None:
         """Compile what `run` calls."""
@@ -155,8 +179,8 @@ class _Part:
         return fields
 
 
-def _window(controller, plant, carry, inputs, seed, deviation, begin, record):
-    """Some samples of one lane, the first of them number `begin`."""
-    setpoints, offsets = inputs
+def _window(controller, plant, carry, inputs, seed, deviation, begin, told, record):
+    """Some samples of one lane, the first of them number `begin`; `told` as in `scan`."""
+    setpoints, offsets, faults = inputs
     errors = noise_samples(deviation, seed[0], seed[1], begin + jnp.arange(len(setpoints)))
-    return scan(controller, plant, carry, (setpoints, offsets, errors), record)
+    return scan(controller, plant, carry, (setpoints, offsets, errors, faults), told, record)

@@ -26,13 +26,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxmpc.condense import condense
 from jaxmpc.controller import ContinuousController, ControllerState, StepInfo
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
 from jaxmpc.mixed_integer import MixedIntegerController, MixedIntegerControllers
+from jaxmpc.sample import Sample, checked
 from jaxmpc.step_response import StepResponseModel, advance_free_response, make_model
 from jaxmpc.structure import Structure
 from jaxmpc.tuning import Tuning
@@ -74,8 +75,12 @@ class ModelSchedule(eqx.Module):
 
     def save(self, path: str | Path) -> Path:
         """Write the schedule as JSON; the file is replaced in one go, so a crash leaves the old one."""
+        return write_atomically(path, json.dumps(self.to_dict()))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of the file, which `from_dict` reads again."""
         model = self.reference
-        body = {
+        return {
             "format": FORMAT,
             "dt": model.dt,
             "cv": list(model.cv_names),
@@ -89,7 +94,6 @@ class ModelSchedule(eqx.Module):
             },
             "coefficients": np.asarray(self.coefficients).tolist(),
         }
-        return write_atomically(path, json.dumps(body))
 
     @classmethod
     def load(cls, path: str | Path) -> ModelSchedule:
@@ -98,10 +102,14 @@ class ModelSchedule(eqx.Module):
             body = json.loads(Path(path).read_text())
         except (OSError, json.JSONDecodeError) as error:
             raise InputError("schedule file", str(path), f"a readable JSON file ({error})") from error
+        return cls.from_dict(body)
+
+    @classmethod
+    def from_dict(cls, body: Any) -> ModelSchedule:
+        """The schedule of a file's content. Raises `InputError` naming the field that is wrong."""
         if not isinstance(body, dict):
-            raise InputError(
-                "schedule file", str(path), "a JSON object with dt, cv, mv, grid and coefficients"
-            )
+            expected = "an object with dt, cv, mv, grid and coefficients"
+            raise InputError("schedule", type(body).__name__, expected)
         for key in ("dt", "cv", "mv", "grid", "coefficients"):
             if key not in body:
                 raise InputError(f"schedule.{key}", "nothing", "a value (the key is missing)")
@@ -216,13 +224,12 @@ class ScheduledController(ContinuousController):
         super().__init__(structure, tuning, schedule.reference)
         self.schedule = schedule
 
-    def step(
-        self, state: ControllerState, cv: Float[Array, " cv"], setpoint: Float[Array, " cv"]
-    ) -> tuple[ControllerState, StepInfo]:
-        """One sample; arguments as in `ContinuousController.step`."""
+    def decide(self, state: ControllerState, sample: Sample) -> tuple[ControllerState, StepInfo]:
+        """`step` of a checked sample, to be traced."""
         s = self.structure
+        standing = self.memory.locate(state, sample.mv, sample.manual).mv
         model = eqx.tree_at(
-            lambda m: m.coefficients, self.schedule.reference, self.schedule.coefficients_at(state.mv)
+            lambda m: m.coefficients, self.schedule.reference, self.schedule.coefficients_at(standing)
         )
         now = eqx.tree_at(
             lambda c: (c.memory.coefficients, c.qp),
@@ -232,9 +239,8 @@ class ScheduledController(ContinuousController):
                 condense(s, self.tuning, model.coefficients, envelope=0, summed=False),
             ),
         )
-        before = state.mv
-        state, info = ContinuousController.step(now, state, cv, setpoint)
-        future = _half_way(self.schedule, now.memory.coefficients, state.future, before, info.move)
+        state, info = ContinuousController.decide(now, state, sample)
+        future = _half_way(self.schedule, now.memory.coefficients, state.future, standing, info.move)
         return eqx.tree_at(lambda s: s.future, state, future), info
 
 
@@ -265,7 +271,8 @@ class ScheduledMixedIntegerControllers(MixedIntegerControllers):
         if isinstance(kept, bool) or not isinstance(kept, int) or kept < 1:
             raise InputError("kept", kept, "a whole number of controllers, 1 or more")
         super().__init__(structure, [tuning], [schedule.reference], **options)
-        self.tuning, self.schedule, self.options, self.kept = tuning, schedule, options, kept
+        self.tuning, self.schedule, self.options = tuning, schedule, options
+        self.spacing, self.kept = spacing, kept
         self.grid = np.array([step or spacing for step in structure.integer_step])
         self.built = 0  # controllers made so far
         self._table: collections.OrderedDict[tuple[float, ...], MixedIntegerControllers] = (
@@ -296,23 +303,30 @@ class ScheduledMixedIntegerControllers(MixedIntegerControllers):
     def step(
         self,
         state: ControllerState,
-        cv: Float[np.ndarray, "scenario cv"],
-        setpoint: Float[np.ndarray, "scenario cv"],
+        cv: Float[ArrayLike, "scenario cv"],
+        setpoint: Float[ArrayLike, "scenario cv"] | Float[ArrayLike, "scenario horizon cv"],
+        mv: Float[ArrayLike, "scenario mv"] | None = None,
+        manual: Bool[ArrayLike, "scenario mv"] | None = None,
     ) -> tuple[ControllerState, StepInfo]:
         """One sample; arguments as in `MixedIntegerControllers.step`. Its time includes the making of a controller."""
         begin = time.perf_counter()
-        controllers, before = self.at(state.mv[0]), state.mv[0]
+        sample = checked(self.structure, cv, setpoint, mv, manual, lanes=1)
+        before = np.where(np.isfinite(sample.mv[0]), sample.mv[0], np.asarray(state.mv)[0])
+        controllers = self.at(before)
         made = time.perf_counter() - begin
-        state, info = controllers.step(state, cv, setpoint)
+        state, info = controllers.step(state, *sample)
         begin = time.perf_counter()
-        if np.any(
-            info.move[0, list(self.structure.integer_mvs)]
-        ):  # moves of the others are too small to matter
+        # moves of the others are too small to matter
+        if np.any(info.move[0, list(self.structure.integer_mvs)]):
             used = controllers.memory.lane(0).coefficients
             future = _corrected(self.schedule, used, state.future[0], before, info.move[0])
             state = eqx.tree_at(lambda s: s.future, state, np.asarray(future)[None])
         made += time.perf_counter() - begin
         return state, eqx.tree_at(lambda i: i.solve_time, info, info.solve_time + made)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy needs; the table is filled again."""
+        return super().__getstate__() | {"_table": collections.OrderedDict()}
 
 
 class ScheduledMixedIntegerController(MixedIntegerController):

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmpc.errors import InputError
+
 FINEST = 1e-9  # smallest relative gap that is asked for; round-off is below it
 SMALLEST = 1e-6  # of the problem's scale: objectives below are taken for zero
 
@@ -48,3 +50,20 @@ def relative_gap(value: Any, bound: Any, scale: Any) -> Any:
     """Gap of plans relative to their objectives, see `closes`; NaN without a plan."""
     with np.errstate(invalid="ignore"):
         return _module(value).maximum(value - bound, 0.0) / reference(value, scale)
+
+
+def check_gap(path: str, gap: Any) -> float:
+    """A relative gap at which a plan may count as optimal, or an `InputError` that names `path`."""
+    if isinstance(gap, bool) or not isinstance(gap, (int, float, np.number)) or not 0 <= gap <= 1:
+        raise InputError(path, gap, "a relative gap from 0 to 1")
+    return float(gap)
+
+
+def check_time_limit(path: str, seconds: Any) -> float | None:
+    """A limit of the time of a solve [s], None for none, or an `InputError` that names `path`."""
+    if seconds is None:
+        return None
+    number = isinstance(seconds, (int, float, np.number)) and not isinstance(seconds, bool)
+    if not number or not 0 <= seconds < np.inf:
+        raise InputError(path, seconds, "a finite time, 0 or more [s], or null (None) for no limit")
+    return float(seconds)

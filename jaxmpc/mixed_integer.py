@@ -10,32 +10,43 @@ import copy
 import dataclasses
 import functools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import ArrayLike, Bool, Float
 
 from jaxmpc import status as codes
 from jaxmpc.batch import Lanes, lanes_of
 from jaxmpc.condense import CondensedQp, QpInstance, make_instance
-from jaxmpc.controller import ControllerState, Memory, StepInfo, first_move, outside_limits
+from jaxmpc.controller import (
+    ControllerState,
+    Memory,
+    StepInfo,
+    first_move,
+    may_switch,
+    outside_limits,
+    without,
+)
 from jaxmpc.errors import InputError
-from jaxmpc.gap import relative_gap
+from jaxmpc.gap import check_gap, check_time_limit, relative_gap
 from jaxmpc.integer import FINISHES
 from jaxmpc.newton import WarmStart
 from jaxmpc.packing import Packing
 from jaxmpc.plan import Planner
 from jaxmpc.relaxation import Solved, relax
 from jaxmpc.relaxer import Relaxer, relaxations
+from jaxmpc.sample import Sample, checked, checked_start
 from jaxmpc.step_response import StepResponseModel, check_match
 from jaxmpc.step_solver import StepSolver
-from jaxmpc.structure import Structure, check_vector
+from jaxmpc.structure import Structure
 from jaxmpc.threads import compile_together
 from jaxmpc.tuning import Tuning
+
+KEPT = 8  # combinations of CVs that are switched off, with what their searches need
 
 
 class MixedIntegerControllers:
@@ -79,15 +90,18 @@ class MixedIntegerControllers:
         for model in models:
             check_match(structure, model)
         self.structure, self.count = structure, counts.pop() if counts else 1
-        self.gap, self.time_limit, self.finish = gap, time_limit, finish
+        self.gap, self.time_limit = check_gap("gap", gap), check_time_limit("time_limit", time_limit)
+        self.finish = finish
         self.solver = StepSolver(structure, tunings, models)
+        self.switching = any(may_switch(tuning) for tuning in tunings)
+        self._without: dict[bytes, MixedIntegerControllers] = {}
         self.memory = lanes_of(
             [
                 Memory(structure, t, m.extended(max(structure.prediction_horizon, m.samples)))
                 for t, m in zip(self.solver.tunings, self.solver.models, strict=True)
             ]
         )
-        self._packings: dict[Any, Any] = {}
+        self._packings: dict[str, Packing] = {}
         self._scales: dict[Relaxer, tuple[Lanes, np.ndarray]] = {}
 
     def part(self, index: np.ndarray) -> MixedIntegerControllers:
@@ -95,8 +109,7 @@ class MixedIntegerControllers:
         if self.count == len(index) and (index == np.arange(self.count)).all():
             return self
         some = copy.copy(self)
-        some.__dict__.pop("constants", None)
-        some.count, some._packings, some._scales = len(index), {}, {}
+        some.count = len(index)
         some.solver, some.memory = self.solver.part(index), self.memory.take(index)
         return some
 
@@ -119,13 +132,14 @@ class MixedIntegerControllers:
         return self._scales[relaxer]
 
     def init(
-        self, cv: Float[np.ndarray, "scenario cv"], mv: Float[np.ndarray, "scenario mv"]
+        self, cv: Float[ArrayLike, "scenario cv"], mv: Float[ArrayLike, "scenario mv"]
     ) -> ControllerState:
-        """State at steady states with measured CVs and present MVs (engineering units)."""
-        for path, value, names in (("cv", cv, self.structure.cv_names), ("mv", mv, self.structure.mv_names)):
-            if np.shape(value) != (self.count, len(names)) or not np.isfinite(value).all():
-                expected = f"finite numbers of shape {[self.count, len(names)]}"
-                raise InputError(path, f"shape {list(np.shape(value))}", expected)
+        """State at steady states with measured CVs and present MVs (engineering units).
+
+        Raises:
+            InputError: for other shapes and values that are not finite.
+        """
+        cv, mv = checked_start(self.structure, cv, mv, lanes=self.count)
         cold = self.solver.relaxer(1).fitting(None, self.count)
         return jax.tree.map(np.asarray, _init(self.memory, cv, mv, cold))
 
@@ -136,27 +150,47 @@ class MixedIntegerControllers:
             step()
             return
         qps, rows, columns = self.constants
-        _, _, shapes, _ = jax.eval_shape(observed, self.memory, qps, rows, columns, state, cv, cv)
+        sample = checked(self.structure, cv, cv, lanes=self.count)
+        _, _, shapes, _ = jax.eval_shape(observed, self.memory, qps, rows, columns, state, sample)
         compile_together(step, lambda: self.solver.relaxer(1).compile(shapes, state.warm))
 
     def step(
         self,
         state: ControllerState,
-        cv: Float[np.ndarray, "scenario cv"],
-        setpoint: Float[np.ndarray, "scenario cv"],
+        cv: Float[ArrayLike, "scenario cv"],
+        setpoint: Float[ArrayLike, "scenario cv"] | Float[ArrayLike, "scenario horizon cv"],
+        mv: Float[ArrayLike, "scenario mv"] | None = None,
+        manual: Bool[ArrayLike, "scenario mv"] | None = None,
     ) -> tuple[ControllerState, StepInfo]:
-        """One sample of all scenarios.
+        """One sample of all scenarios; arguments as in `ContinuousController.step`, the scenario axis first."""
+        sample = checked(self.structure, cv, setpoint, mv, manual, lanes=self.count)
+        return self._switched(state, sample)._decide(state, sample)
 
-        Args:
-            state: from `init` or the previous step.
-            cv: measurements now [CV unit].
-            setpoint: held over the horizon [CV unit].
-        """
+    def _switched(self, state: ControllerState, sample: Sample) -> MixedIntegerControllers:
+        """These controllers without the CVs that this sample switches off."""
+        if not self.switching:
+            return self
+        off = np.asarray(_off(self.memory, state, sample.cv))
+        if not off.any():
+            return self
+        pattern = off.tobytes()
+        if pattern not in self._without:
+            every = self.solver.tunings * (self.count if len(self.solver.tunings) == 1 else 1)
+            made = {(id(t), own.tobytes()): without(t, own) for t, own in zip(every, off, strict=True)}
+            tunings = [made[id(t), own.tobytes()] for t, own in zip(every, off, strict=True)]
+            same: dict[str, Any] = dict(gap=self.gap, time_limit=self.time_limit, finish=self.finish)
+            reduced = MixedIntegerControllers(self.structure, tunings, self.solver.models, **same)
+            reduced.solver.has_limits = self.solver.has_limits  # so that the same programs serve
+            self._without[pattern] = reduced
+            while len(self._without) > KEPT:
+                self._without.pop(next(iter(self._without)))
+        return self._without[pattern]
+
+    def _decide(self, state: ControllerState, sample: Sample) -> tuple[ControllerState, StepInfo]:
         begin, compiled = time.perf_counter(), self.solver.compiling
-        known = np.isfinite(np.asarray(cv)).all(axis=1)
-        target = np.asarray(setpoint, dtype=np.float64)
         narrow = self.solver.relaxer(1)
-        observed, (state, free_response, ready, root) = self._observe(narrow, state, cv, target)
+        target = sample.setpoint
+        observed, (state, free_response, ready, root) = self._observe(narrow, state, sample)
 
         def instances_of(relaxer: Relaxer) -> QpInstance:
             if relaxer is narrow:
@@ -172,7 +206,7 @@ class MixedIntegerControllers:
             time_limit=self.time_limit,
             finish=self.finish,
         )
-        good = known & np.array([result.x is not None for result in results])
+        good = np.array([result.x is not None for result in results])
         none = np.zeros(instances.lower.shape[-1])
         x = np.stack([none if r.x is None else r.x for r in results])
         if root is None:  # otherwise all that is remembered is there already
@@ -190,9 +224,11 @@ class MixedIntegerControllers:
             move=moves[:, 0],
             mv=state.mv,
             moves=moves,
-            status=np.where(known, [r.status for r in results], codes.FAILED),
+            status=np.array([r.status for r in results]),
             fallback=~good,
             recovering=recovering,
+            quality=state.sensors.quality,
+            off=state.sensors.off,
             objective=certified(value),
             bound=certified(bound),
             gap=certified(gap),
@@ -204,37 +240,53 @@ class MixedIntegerControllers:
         # the module's own constructor would take longer than all of this
         return state, _INFO.unflatten([values[name] for name in _FIELDS])
 
-    def _observe(self, narrow: Relaxer, state: ControllerState, cv, setpoint):
+    def _observe(self, narrow: Relaxer, state: ControllerState, sample: Sample):
         """`_observe` on the host: packed, and ``(state, free response, problems, relaxations or None)``."""
-        given = jax.tree.map(np.asarray, state), np.asarray(cv, dtype=np.float64), setpoint
+        given = jax.tree.map(np.asarray, (state, sample))
         qps, rows, columns = self.constants
-        packings = self._packings.get(narrow)
-        if packings is None:
+
+        def shapes():
             s = self.structure
             free_response = jax.ShapeDtypeStruct((self.count, s.prediction_horizon, s.cv_count), jnp.float64)
-            instances = jax.eval_shape(_instances, self.memory, qps, given[0], free_response, setpoint)
-            root = None if rows is None else narrow.solved_shapes
-            packings = Packing.of(given), Packing.of((given[0], free_response, instances, root))
-            self._packings[narrow] = packings
-        observed = np.asarray(_observe(self.memory, qps, rows, columns, packings[0].pack(given), packings))
+            instances = jax.eval_shape(_instances, self.memory, qps, given[0], free_response, sample.setpoint)
+            return given[0], free_response, instances, None if rows is None else narrow.solved_shapes
+
+        of_given = self._packing(f"given {sample.setpoint.ndim}", lambda: given)
+        packings = of_given, self._packing("observed", shapes)
+        observed = np.asarray(_observe(self.memory, qps, rows, columns, of_given.pack(given), packings))
         return observed, packings[1].unpack(observed)
 
     def _remember(self, relaxer: Relaxer, observed, x, good):
         """`_remember` on the host, for the problems of this relaxer."""
         if isinstance(observed, np.ndarray):
-            of_observed = self._packings[relaxer][1]
+            of_observed = self._packings["observed"]
         else:
             observed = jax.tree.map(np.asarray, observed)
             of_observed = Packing.of(observed)
             observed = of_observed.pack(observed)
-        packing = self._packings.get("remembered")
-        if packing is None:
+
+        def shapes():
             state = of_observed.unpack(observed)[0]
-            recovering = jax.ShapeDtypeStruct((self.count,), jnp.bool)
-            packing = Packing.of((state, state.plan, recovering))
-            self._packings["remembered"] = packing
+            return state, state.plan, jax.ShapeDtypeStruct((self.count,), jnp.bool)
+
+        packing = self._packing("remembered", shapes)
         scales, packings = self.scales_of(relaxer)[0], (of_observed, packing)
         return packing.unpack(np.asarray(_remember(self.memory, scales, observed, x, good, packings)))
+
+    def _packing(self, name: str, tree: Callable[[], Any]) -> Packing:
+        """The packing of a tree of this name, made when first needed."""
+        if name not in self._packings:
+            self._packings[name] = Packing.of(tree())
+        return self._packings[name]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy needs; all else is made again, and forms of trees do not survive a copy."""
+        derived = ("constants", "_packings", "_scales", "_without")
+        return {key: value for key, value in self.__dict__.items() if key not in derived}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._packings, self._scales, self._without = {}, {}, {}
 
 
 _FIELDS = [field.name for field in dataclasses.fields(StepInfo)]
@@ -252,8 +304,18 @@ def _observe(memory: Lanes[Memory], qps: Lanes[CondensedQp], rows, columns, give
     return packings[1].pack(observed(memory, qps, rows, columns, *packings[0].unpack(given)))
 
 
+@jax.jit
+def _off(memory: Lanes[Memory], state: ControllerState, cv):
+    """CVs that are switched off after these measurements, ``"scenario cv"``."""
+
+    def lane(own, sensors, cv):
+        return sensors.judged(eqx.combine(own, memory.shared).tuning, cv).off
+
+    return jax.vmap(lane)(memory.each, state.sensors, cv)
+
+
 def observed(
-    memory: Lanes[Memory], qps: Lanes[CondensedQp], rows, columns, state: ControllerState, cv, setpoint
+    memory: Lanes[Memory], qps: Lanes[CondensedQp], rows, columns, state: ControllerState, sample: Sample
 ):
     """After a measurement, ``"scenario"``: bias and free response, the problems for moves of one step, their relaxations.
 
@@ -263,15 +325,14 @@ def observed(
         rows: hard rows; None if the relaxations are not wanted.
         columns: integer moves.
         state: before the sample.
-        cv: measured [CV unit].
-        setpoint: held over the horizon [CV unit].
+        sample: what is known.
     """
 
-    def lane(own, state, cv):
-        return eqx.combine(own, memory.shared).observe(state, cv)
+    def lane(own, state, sample: Sample):
+        return eqx.combine(own, memory.shared).observe(state, sample.cv, sample.mv, sample.manual)
 
-    state, free_response = jax.vmap(lane)(memory.each, state, cv)
-    instances = _instances(memory, qps, state, free_response, setpoint)
+    state, free_response = jax.vmap(lane)(memory.each, state, sample)
+    instances = _instances(memory, qps, state, free_response, sample.setpoint)
 
     def relaxed(own_qp, instance, start):
         qp = eqx.combine(own_qp, qps.shared)
@@ -291,7 +352,7 @@ def _instances(
         its = eqx.combine(own, memory.shared)
         return make_instance(
             its.structure,
-            its.tuning,
+            its.limits_now(state),
             eqx.combine(own_qp, qps.shared),
             free_response=free_response,
             setpoint=jnp.broadcast_to(setpoint, free_response.shape),
@@ -329,7 +390,7 @@ def remembered(memory: Lanes[Memory], scales: Lanes, instances, state: Controlle
         planned = (x * scale).reshape(its.structure.mv_count, -1).T
         first = first_move(its.structure, scale, instance, planned[0])
         moves = jnp.where(good, planned.at[0].set(first), 0.0)
-        recovering = outside_limits(its.tuning, state.mv)
+        recovering = outside_limits(its.limits_now(state), state.mv)
         warm = jax.tree.map(lambda new, old: jnp.where(good, new, old), warm, state.warm)
         return its.remember(state, moves[0], moves, warm), moves, recovering
 
@@ -376,21 +437,27 @@ class MixedIntegerController:
         """Prediction and bookkeeping of this controller."""
         return self.together.memory.lane(0)
 
-    def init(self, cv, mv) -> ControllerState:
-        """State at a steady state with measured CVs and present MVs (engineering units)."""
-        check_vector("cv", cv, self.structure.cv_names, "CV unit")
-        check_vector("mv", mv, self.structure.mv_names, "MV unit")
-        return _first(self.together.init(np.asarray(cv)[None], np.asarray(mv)[None]))
+    def init(self, cv: Float[ArrayLike, " cv"], mv: Float[ArrayLike, " mv"]) -> ControllerState:
+        """State at a steady state; arguments and errors as in `ContinuousController.init`."""
+        start = checked_start(self.structure, cv, mv)
+        return _first(self.together.init(*(np.asarray(value)[None] for value in start)))
 
-    def prepare(self, state: ControllerState, cv) -> None:
+    def prepare(self, state: ControllerState, cv: Float[ArrayLike, " cv"]) -> None:
         """Compile what every sample needs; arguments as in `step`."""
         self.step(state, cv, cv)
 
-    def step(self, state: ControllerState, cv, setpoint) -> tuple[ControllerState, StepInfo]:
-        """One sample; arguments as in `ContinuousController.step`."""
-        lane = jax.tree.map(lambda leaf: np.asarray(leaf)[None], state)
-        together = self.together.step(lane, np.asarray(cv)[None], np.asarray(setpoint)[None])
-        return _first(together)
+    def step(
+        self,
+        state: ControllerState,
+        cv: Float[ArrayLike, " cv"],
+        setpoint: Float[ArrayLike, " cv"] | Float[ArrayLike, "horizon cv"],
+        mv: Float[ArrayLike, " mv"] | None = None,
+        manual: Bool[ArrayLike, " mv"] | None = None,
+    ) -> tuple[ControllerState, StepInfo]:
+        """One sample; arguments and errors as in `ContinuousController.step`."""
+        sample = checked(self.structure, cv, setpoint, mv, manual)
+        lane, of_lane = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (state, sample))
+        return _first(self.together.step(lane, *of_lane))
 
 
 def _first(tree):

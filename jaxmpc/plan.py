@@ -20,12 +20,13 @@ from jaxmpc.blocking import first_position_rows, moves_per_block, sample_moves
 from jaxmpc.condense import DRIFT, QpInstance, dynamic_matrix, make_instance
 from jaxmpc.constants import Constants
 from jaxmpc.errors import InputError
-from jaxmpc.gap import closes, relative_gap
+from jaxmpc.gap import check_gap, check_time_limit, closes, relative_gap
 from jaxmpc.integer import FINISHES, continuous_feasible
 from jaxmpc.newton import WarmStart
 from jaxmpc.packing import Packing, flattened, rebuilt
 from jaxmpc.relaxation import relax
 from jaxmpc.relaxer import Relaxations, Relaxer, relaxations
+from jaxmpc.sample import require_double_precision
 from jaxmpc.search import SearchResult
 from jaxmpc.step_response import StepResponseModel, check_match
 from jaxmpc.step_solver import StepSolver
@@ -118,6 +119,10 @@ class Planner:
         self._started = False
         self._flat: Any = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy needs; forms of trees do not survive a copy."""
+        return self.__dict__ | {"_packings": {}, "_flat": None}
+
     def solve(
         self,
         *,
@@ -150,6 +155,8 @@ class Planner:
         """
         if finish not in FINISHES:
             raise InputError("finish", finish, f"one of {', '.join(FINISHES)}")
+        require_double_precision()
+        gap, time_limit = check_gap("gap", gap), check_time_limit("time_limit", time_limit)
         as_array = lambda v: np.asarray(v, dtype=np.float64)  # noqa: E731
         free_response, setpoint, mv_now = as_array(free_response), as_array(setpoint), as_array(mv_now)
         past = None if past_moves is None else as_array(past_moves)

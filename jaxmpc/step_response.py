@@ -63,7 +63,11 @@ class StepResponseModel(eqx.Module):
 
     def save(self, path: str | Path) -> Path:
         """Write the model as JSON; the file is replaced in one go, so a crash leaves the old one."""
-        body = {
+        return write_atomically(path, json.dumps(self.to_dict(), indent=1))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of the file, which `from_dict` reads again."""
+        return {
             "format": FORMAT,
             "dt": self.dt,
             "cv": list(self.cv_names),
@@ -74,7 +78,6 @@ class StepResponseModel(eqx.Module):
             "provenance": dict(self.provenance),
             "coefficients": np.asarray(self.coefficients).tolist(),
         }
-        return write_atomically(path, json.dumps(body, indent=1))
 
     @classmethod
     def load(cls, path: str | Path) -> StepResponseModel:
@@ -83,8 +86,13 @@ class StepResponseModel(eqx.Module):
             body = json.loads(Path(path).read_text())
         except (OSError, json.JSONDecodeError) as error:
             raise InputError("model file", str(path), f"a readable JSON file ({error})") from error
+        return cls.from_dict(body)
+
+    @classmethod
+    def from_dict(cls, body: Any) -> StepResponseModel:
+        """The model of a file's content. Raises `InputError` naming the field that is wrong."""
         if not isinstance(body, dict):
-            raise InputError("model file", str(path), "a JSON object with dt, cv, mv and coefficients")
+            raise InputError("model", type(body).__name__, "an object with dt, cv, mv and coefficients")
         for key in ("dt", "cv", "mv", "coefficients"):
             if key not in body:
                 raise InputError(f"model.{key}", "nothing", "a value (the key is missing)")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -61,6 +62,10 @@ class StepSolver:
             each = [made[id(t), id(m)] for t, m in zip(self.tunings, self.models, strict=True)]
             self._relaxers[envelope] = Relaxer(each[:1] if len(made) == 1 else each)
         return self._relaxers[envelope]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy needs; compiled relaxations are made again."""
+        return self.__dict__ | {"_relaxers": {}}
 
     def part(self, index: np.ndarray) -> StepSolver:
         """The solver of some scenarios."""

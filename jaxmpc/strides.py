@@ -26,11 +26,13 @@ from jaxmpc.condense import QpInstance, integer_columns
 from jaxmpc.controller import ControllerState
 from jaxmpc.gap import FINEST, closes, relative_gap
 from jaxmpc.integer import compiles, solve_integers
+from jaxmpc.measurement import received
 from jaxmpc.mixed_integer import MixedIntegerControllers, observed, remembered
 from jaxmpc.packing import Packing, flattened, rebuilt
 from jaxmpc.plant import WellPlant, WellState
 from jaxmpc.relaxation import Solved
 from jaxmpc.relaxer import relaxations
+from jaxmpc.sample import Sample, checked
 from jaxmpc.structure import Structure
 from jaxmpc.threads import compile_together, parts_of, side_by_side
 
@@ -40,13 +42,14 @@ APART = 5  # Newton steps that take as long as the rest of a sample
 RELAXATION = codes.finisher_code("relaxation")
 
 
-class Sample(NamedTuple):
+class Moment(NamedTuple):
     """A sample whose measurement is known; all arrays with a scenario axis.
 
     Attributes:
         state: of the controller, after the measurement.
         plant: state of the well.
-        cv: measured.
+        cv: measured by sensors without fault.
+        mv: where the actuators stand.
         instance, root: its problem and the relaxation of that.
         x: the plan, scaled.
         good: whether there is one.
@@ -56,6 +59,7 @@ class Sample(NamedTuple):
     state: ControllerState
     plant: WellState
     cv: Float[Array, "scenario cv"]
+    mv: Float[Array, "scenario mv"]
     instance: QpInstance
     root: Solved
     x: Float[Array, "scenario n"]
@@ -69,6 +73,8 @@ class Seen(NamedTuple):
     cv: Array
     bias: Array
     bias_raw: Array
+    quality: Array
+    off: Array
     objective: Array
     bound: Array
     nodes: Array
@@ -97,16 +103,19 @@ class Loop(NamedTuple):
 
 
 def able(controllers: MixedIntegerControllers) -> bool:
-    """Whether samples can be closed on the device: moves of one step, no way to finish prescribed, no short time limit."""
+    """Whether samples can be closed on the device: moves of one step, no CV that may be switched off, no way to finish
+    prescribed, no short time limit.
+    """
     c = controllers
-    plain = type(c) is MixedIntegerControllers and c.solver.narrow
+    plain = type(c) is MixedIntegerControllers and c.solver.narrow and not c.switching
     return plain and compiles(c.solver.relaxer(1), c.finish, c.time_limit)
 
 
 def simulate_in_strides(
     controllers: MixedIntegerControllers,
     plants: Lanes[WellPlant],
-    inputs: tuple[np.ndarray, np.ndarray, np.ndarray],
+    inputs: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    told: np.ndarray,
     progress: Callable[[int], None] | None = None,
 ) -> dict[str, np.ndarray]:
     """Closed loops of controllers that advance together; the fields of `Trajectory`, ``"scenario sample ..."``.
@@ -117,14 +126,18 @@ def simulate_in_strides(
     Args:
         controllers: see `able`.
         plants: one well for all, or one per scenario.
-        inputs: setpoints ``"scenario sample cv"``, pressure offsets ``"scenario sample"`` [bar] and measurement errors
-            ``"scenario sample cv"``.
+        inputs: setpoints ``"scenario sample cv"``, pressure offsets ``"scenario sample"`` [bar], and noise and faults of the
+            sensors ``"scenario sample cv"`` [CV unit].
+        told: ``"scenario"``, whether the controller is told where the actuators stand.
         progress: told how many samples of all scenarios were done, first when everything is compiled; by one thread at a
             time.
     """
     lock, count = threading.Lock(), controllers.count
     parts = parts_of(count, TOGETHER)
-    runs = [_Run(controllers.part(part), plants.take(part), [v[part] for v in inputs]) for part in parts]
+    runs = [
+        _Run(controllers.part(part), plants.take(part), [v[part] for v in inputs], told[part])
+        for part in parts
+    ]
     stages = [run.start() for run in runs]  # the first compiles
     real = [min(len(part), count - int(part[0])) for part in parts]
 
@@ -190,13 +203,16 @@ class _Run:
     """Loops under way.
 
     Args:
-        controllers, plants, inputs: as in `simulate_in_strides`, of scenarios that share every call.
+        controllers, plants, inputs, told: as in `simulate_in_strides`, of scenarios that share every call.
     """
 
-    def __init__(self, controllers: MixedIntegerControllers, plants: Lanes[WellPlant], inputs):
+    def __init__(
+        self, controllers: MixedIntegerControllers, plants: Lanes[WellPlant], inputs, told: np.ndarray
+    ):
         self.controllers, self.plants, self.count = controllers, plants, controllers.count
         self.samples = inputs[0].shape[1]
-        self.inputs = np.concatenate([inputs[0], inputs[2], inputs[1][..., None]], axis=2)
+        setpoints, offsets, errors, faults = inputs
+        self.inputs = np.concatenate([setpoints, errors, faults, offsets[..., None]], axis=2)
         # beyond the end the last sample is repeated
         self.inputs = np.concatenate(
             [self.inputs, np.repeat(self.inputs[:, -1:], LONGEST + 1, axis=1)], axis=1
@@ -208,24 +224,26 @@ class _Run:
             Loop(memory, qps, self.narrow.tables, rows, controllers.scales_of(self.narrow)[0], plants)
         )
         scale = controllers.scales_of(self.narrow)[1]
-        self.gaps = np.stack([np.full(self.count, max(controllers.gap, FINEST)), scale], axis=1)
+        gap = np.full(self.count, max(controllers.gap, FINEST))
+        self.settings = np.stack([gap, scale, told.astype(float)], axis=1)
 
     def start(self) -> _Stage:
         """Before the first sample, everything compiled."""
         c, steady = self.controllers, _steady(self.plants, self.count)
         plant_state, outputs = jax.tree.map(np.asarray, steady)
-        state = c.init(outputs.cv, outputs.mv)
+        state, mv = c.init(outputs.cv, outputs.mv), outputs.mv
         cvs = outputs.cv.shape[1]
         cv: Any = outputs.cv + self.inputs[:, 0, cvs : 2 * cvs]
         memory, (qps, rows, columns) = c.memory, c.constants
-        shapes = jax.eval_shape(observed, memory, qps, rows, columns, state, cv, cv)
+        sample = checked(c.structure, cv, outputs.cv, mv, lanes=self.count)
+        shapes = jax.eval_shape(observed, memory, qps, rows, columns, state, sample)
         _, _, instance, root = jax.tree.map(lambda v: np.zeros(v.shape, v.dtype), shapes)
         no: Any = np.zeros(self.count, dtype=bool)
-        sample = Sample(state, plant_state, cv, instance, root, np.zeros_like(root.warm.x), no, no)
-        self.of_sample = Packing.of(sample)
+        moment = Moment(state, plant_state, cv, mv, instance, root, np.zeros_like(root.warm.x), no, no)
+        self.of_sample = Packing.of(moment)
         statics = _Statics(c.structure, self.form, self.of_sample, self.count > 1)
         self.program = _program(statics)
-        stage = _Stage(self.of_sample.pack(sample), False)
+        stage = _Stage(self.of_sample.pack(moment), False)
         search = lambda: self.narrow.compile(instance, state.warm)  # noqa: E731
         compile_together(lambda: self.stride(stage, 0), *([search] if self.count == 1 else []))
         return stage
@@ -238,14 +256,14 @@ class _Run:
             many samples were measured.
         """
         now = self.inputs[:, begin : begin + LONGEST + 1]
-        packed, (seen, done), (count, decided) = self.program(self.leaves, stage.packed, now, self.gaps)
+        packed, (seen, done), (count, decided) = self.program(self.leaves, stage.packed, now, self.settings)
         rows = lambda tree: jax.tree.map(np.asarray, tree)  # noqa: E731
         return _Stage(packed, bool(decided)), rows(seen), rows(done), int(count)
 
     def decide(self, stage: _Stage, fields: dict[str, np.ndarray], at: int) -> _Stage:
         """Decide sample `at` outside the stride, and record how."""
         begin = time.perf_counter()
-        sample: Sample = self.of_sample.unpack(np.array(stage.packed))
+        sample: Moment = self.of_sample.unpack(np.array(stage.packed))
         c = self.controllers
         which = np.flatnonzero(~sample.decided)
         starts = c.solver.starts(self.narrow, np.asarray(sample.state.plan))
@@ -262,10 +280,9 @@ class _Run:
         )
         x, good = sample.x.copy(), sample.good.copy()
         for i, result in zip(which, results, strict=True):
-            known = bool(np.isfinite(sample.cv[i]).all())
-            good[i] = known and result.x is not None
+            good[i] = result.x is not None
             found = {
-                "status": result.status if known else codes.FAILED,
+                "status": result.status,
                 "fallback": not good[i],
                 "nodes": result.nodes,
                 "finished_by": codes.finisher_code(result.finished_by) if good[i] else 0,
@@ -305,26 +322,28 @@ def _program(statics: _Statics):
     return jax.jit(functools.partial(_stride, statics))
 
 
-def _decided(structure: Structure, loop: Loop, instance, root: Solved, gaps):
+def _decided(structure: Structure, loop: Loop, instance, root: Solved, gap):
     """The compiled search of all scenarios whose root has a bound."""
 
     def lane(own, instance, root, gap):
         qp, tables = eqx.combine(own, (loop.qps.shared, loop.tables.shared))
         return decide(structure, qp, tables, loop.rows, instance, root, gap)
 
-    return jax.vmap(lane)((loop.qps.each, loop.tables.each), instance, root, gaps[:, 0])
+    return jax.vmap(lane)((loop.qps.each, loop.tables.each), instance, root, gap)
 
 
-def _stride(statics: _Statics, leaves, packed, inputs, gaps):
+def _stride(statics: _Statics, leaves, packed, inputs, settings):
     """See `_Run.stride`."""
     loop: Loop = rebuilt(statics.form, leaves)
-    sample: Sample = statics.of_sample.unpack(packed)
+    sample: Moment = statics.of_sample.unpack(packed)
     columns = np.asarray(integer_columns(statics.structure))
     cvs, mvs = sample.cv.shape[1], sample.state.mv.shape[1]
-    setpoints, errors, offsets = inputs[..., :cvs], inputs[..., cvs : 2 * cvs], inputs[..., -1]
+    setpoints, errors, faults = (inputs[..., k * cvs : (k + 1) * cvs] for k in range(3))
+    offsets = inputs[..., -1]
+    gap, scale, told = settings[:, 0], settings[:, 1], settings[:, 2:] > 0
     late = sample.decided[0].astype(int)  # measured is sample `late`, then late + 1, ...
 
-    def carry_out(sample: Sample, at) -> tuple[Sample, Done]:
+    def carry_out(sample: Moment, at) -> tuple[Moment, Done]:
         state, moves, _ = remembered(
             loop.memory, loop.scales, sample.instance, sample.state, sample.x, sample.good, sample.root.warm
         )
@@ -333,38 +352,44 @@ def _stride(statics: _Statics, leaves, packed, inputs, gaps):
             return eqx.combine(own, loop.plants.shared).step(plant_state, mv, offset)
 
         plant_state, outputs = jax.vmap(advance)(loop.plants.each, sample.plant, state.mv, offsets[:, at])
-        sample = sample._replace(state=state, plant=plant_state, cv=outputs.cv + errors[:, at + 1])
+        cv = outputs.cv + errors[:, at + 1]
+        sample = sample._replace(state=state, plant=plant_state, cv=cv, mv=outputs.mv)
         return sample, Done(state.mv, outputs.mv, moves[:, 0], moves)
 
     def forward(carry):
         sample, seen, done, count = carry
         at = late + count - 1  # sample to carry out; -1 for none
 
-        def nothing(sample: Sample, _):
+        def nothing(sample: Moment, _):
             return sample, jax.tree.map(lambda v: jnp.zeros((v.shape[0], *v.shape[2:]), v.dtype), done)
 
         sample, did = jax.lax.cond(at >= 0, carry_out, nothing, sample, at)
         row = jnp.where(at >= 0, at, LONGEST + 1)  # out of range: not written
         done = jax.tree.map(lambda rows, new: rows.at[:, row].set(new, mode="drop"), done, did)
-        state, _, instance, root = observed(
-            loop.memory, loop.qps, loop.rows, columns, sample.state, sample.cv, setpoints[:, at + 1]
+        given = Sample(
+            cv=received(sample.cv, faults[:, at + 1], sample.state.sensors.value),
+            setpoint=setpoints[:, at + 1],
+            mv=jnp.where(told, sample.mv, jnp.nan),
+            manual=jnp.zeros(sample.mv.shape, dtype=bool),
         )
+        state, _, instance, root = observed(loop.memory, loop.qps, loop.rows, columns, sample.state, given)
         assert root is not None
-        known = jnp.isfinite(sample.cv).all(axis=1)
         x = root.warm.x
         x = x.at[:, columns].set(jnp.round(x[:, columns]))
         value, steps = root.snapped, root.steps.astype(int)
         bound = jnp.minimum(jnp.maximum(root.bound, 0.0), value)
-        closed = known & closes(value, bound, gaps[:, 1], gaps[:, 0])
+        closed = closes(value, bound, scale, gap)
         nodes, finished_by = jnp.ones_like(steps), jnp.full_like(steps, RELAXATION)
         if statics.inside:
-            open_root = root._replace(bound=jnp.where(closed | ~known, jnp.nan, root.bound))
-            found = _decided(statics.structure, loop, instance, open_root, gaps)
+            open_root = root._replace(bound=jnp.where(closed, jnp.nan, root.bound))
+            found = _decided(statics.structure, loop, instance, open_root, gap)
             pick = lambda new, old: jnp.where(found.closed.reshape(-1, *[1] * (old.ndim - 1)), new, old)  # noqa: E731
             x, value, bound = pick(found.x, x), pick(found.value, value), pick(found.bound, bound)
             nodes, finished_by = pick(found.nodes, nodes), pick(found.finished_by, finished_by)
             steps, closed = steps + found.steps, closed | found.closed
-        now = Seen(sample.cv, state.bias, state.bias_raw, value, bound, nodes, finished_by, steps)
+        sensors = state.sensors
+        kept = sample.cv, state.bias, state.bias_raw, sensors.quality, sensors.off
+        now = Seen(*kept, value, bound, nodes, finished_by, steps)
         seen = jax.tree.map(lambda rows, new: rows.at[:, count].set(new), seen, now)
         sample = sample._replace(state=state, instance=instance, root=root, x=x, good=closed, decided=closed)
         return sample, seen, done, count + 1
@@ -377,7 +402,8 @@ def _stride(statics: _Statics, leaves, packed, inputs, gaps):
         return jnp.zeros((sample.cv.shape[0], LONGEST + 1, *shape), dtype=dtype)
 
     whole = lambda: table(dtype=int)  # noqa: E731
-    seen = Seen(table(cvs), table(cvs), table(cvs), table(), table(), whole(), whole(), whole())
+    flags = table(cvs, dtype=int), table(cvs, dtype=bool)
+    seen = Seen(table(cvs), table(cvs), table(cvs), *flags, table(), table(), whole(), whole(), whole())
     done = Done(table(mvs), table(mvs), table(mvs), table(*sample.state.plan.shape[1:]))
     sample, seen, done, count = jax.lax.while_loop(onward, forward, (sample, seen, done, 0))
     return statics.of_sample.pack(sample), (seen, done), (count, sample.decided.all())

@@ -47,6 +47,13 @@ def check_offsets(offsets: np.ndarray, *shapes: tuple[int, ...]) -> None:
         )
 
 
+def check_faults(faults: np.ndarray, *shapes: tuple[int, ...]) -> None:
+    """Refuse errors of sensors [CV unit] of another shape."""
+    if faults.shape not in shapes:
+        expected = " or ".join(str(list(shape)) for shape in shapes)
+        raise InputError("faults", f"shape {list(faults.shape)}", f"{expected} errors, one per sample and CV")
+
+
 def _structure(controllers: Lanes[ContinuousController] | MixedIntegerControllers) -> Structure:
     lanes = isinstance(controllers, Lanes)
     return controllers.shared.structure if lanes else controllers.structure
@@ -68,6 +75,8 @@ class Sweep:
     offsets: np.ndarray  # "sample" or "lane sample"
     deviation: np.ndarray  # "lane cv"
     seeds: np.ndarray  # "lane 2": seed and stream
+    faults: np.ndarray  # "sample cv" or "lane sample cv"
+    position_feedback: np.ndarray  # "lane"
     samples: int
     count: int
 
@@ -77,7 +86,9 @@ class Sweep:
         return _structure(self.controllers)
 
     @classmethod
-    def checked(cls, controllers, plants, reference, samples, disturbance, noise, seed) -> Sweep:
+    def checked(
+        cls, controllers, plants, reference, samples, disturbance, noise, seed, faults, position_feedback
+    ) -> Sweep:
         """The sweep, or an `InputError` that names what does not fit."""
         if not isinstance(controllers, (Lanes, MixedIntegerControllers)):
             controllers = for_all(controllers)
@@ -96,6 +107,11 @@ class Sweep:
         by_reference = dict(zip(dict.fromkeys(references), setpoints, strict=True))
         setpoints = [by_reference[r] for r in references]
         offsets = np.zeros(samples or 0) if disturbance is None else np.asarray(disturbance, dtype=np.float64)
+        shape = (samples or 0, structure.cv_count)
+        failing = np.zeros(shape) if faults is None else np.asarray(faults, dtype=np.float64)
+        told = np.asarray(position_feedback)
+        if told.ndim > 1 or told.dtype != np.bool_:
+            raise InputError("position_feedback", position_feedback, "true or false, or one of them per lane")
         deviation, seed = check_deviation(noise, structure.cv_count), check_seed(seed)
         counts = {
             "controllers": controllers.count,
@@ -104,6 +120,8 @@ class Sweep:
             "disturbance": len(offsets) if offsets.ndim == 2 else None,
             "noise": len(deviation) if deviation.ndim == 2 else None,
             "seed": len(seed) if seed.ndim else None,
+            "faults": len(failing) if failing.ndim == 3 else None,
+            "position_feedback": len(told) if told.ndim else None,
         }
         given = {name: count for name, count in counts.items() if count is not None}
         if len(set(given.values())) != 1 or not min(given.values()):
@@ -112,6 +130,7 @@ class Sweep:
             )
         count = next(iter(given.values()))
         check_offsets(offsets, (len(setpoints[0]),), (count, len(setpoints[0])))
+        check_faults(failing, setpoints[0].shape, (count, *setpoints[0].shape))
         stream = np.arange(count) if seed.ndim == 0 else np.zeros(count)
         return cls(
             controllers=controllers,
@@ -120,6 +139,8 @@ class Sweep:
             offsets=offsets,
             deviation=np.broadcast_to(deviation, (count, structure.cv_count)),
             seeds=np.stack([np.broadcast_to(seed, count), stream], axis=1).astype(np.int64),
+            faults=failing,
+            position_feedback=np.broadcast_to(told, count),
             samples=len(setpoints[0]),
             count=count,
         )
@@ -135,3 +156,9 @@ class Sweep:
         if self.offsets.ndim == 1:
             return np.broadcast_to(self.offsets, (len(index), self.samples))
         return self.offsets[index]
+
+    def faults_of(self, index: np.ndarray) -> np.ndarray:
+        """Errors of the sensors "lane sample cv" of some lanes [CV unit]."""
+        if self.faults.ndim == 2:
+            return np.broadcast_to(self.faults, (len(index), *self.faults.shape))
+        return self.faults[index]

@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.core import Tracer
+from jaxtyping import ArrayLike, Bool, Float
 
 from jaxmpc.closed_loop import simulate
 from jaxmpc.controller import ContinuousController, ControllerState, StepInfo
@@ -24,10 +25,11 @@ from jaxmpc.host_well import HostWell
 from jaxmpc.mixed_integer import MixedIntegerController
 from jaxmpc.plant import WellPlant
 from jaxmpc.reference import Reference
+from jaxmpc.sample import checked, checked_start
 from jaxmpc.step_response import StepResponseModel, check_match
 from jaxmpc.structure import Structure
 from jaxmpc.trajectory import Trajectory
-from jaxmpc.tuning import CV_FIELDS, Tuning
+from jaxmpc.tuning import CV_FIELDS, DEFAULTS, Tuning
 
 SUFFIX = ".target"
 
@@ -76,7 +78,7 @@ def augment(
     wide_names = structure.cv_names + names
     units = _units(structure.cv_units, structure.cv_count, structure.mv_units, mvs)
     wide_structure = dataclasses.replace(structure, cv_names=wide_names, cv_units=units)
-    new: dict[str, Any] = dict.fromkeys(CV_FIELDS, 0.0) | {"cv_low": -np.inf, "cv_high": np.inf}
+    new: dict[str, Any] = {key: DEFAULTS.get(key, 0.0) for key in CV_FIELDS} | {"slack_weight": 0.0}
     new["cv_weight"] = [float(target_weight[structure.mv_names[i]]) for i in mvs]
     wide = {
         key: jnp.concatenate([getattr(tuning, key), jnp.broadcast_to(jnp.asarray(new[key]), (len(mvs),))])
@@ -135,32 +137,54 @@ class TargetController(eqx.Module):
         self.controller: Any = kind(*augment(structure, tuning, model, target_weight), **options)
         self.targeted = tuple(i for i, name in enumerate(structure.mv_names) if name in target_weight)
 
-    def init(self, cv: Float[Array, " cv"], mv: Float[Array, " mv"]) -> ControllerState:
-        """State at a steady state with measured CVs and present MVs (engineering units)."""
+    def init(self, cv: Float[ArrayLike, " cv"], mv: Float[ArrayLike, " mv"]) -> ControllerState:
+        """State at a steady state; arguments and errors as in `ContinuousController.init`."""
+        cv, mv = checked_start(self.structure, cv, mv)
         return self.controller.init(self._with(cv, mv), mv)
 
     def step(
         self,
         state: ControllerState,
-        cv: Float[Array, " cv"],
-        setpoint: Float[Array, " cv"],
-        mv_target: Float[Array, " mv"],
+        cv: Float[ArrayLike, " cv"],
+        setpoint: Float[ArrayLike, " cv"] | Float[ArrayLike, "horizon cv"],
+        mv_target: Float[ArrayLike, " mv"],
+        mv: Float[ArrayLike, " mv"] | None = None,
+        manual: Bool[ArrayLike, " mv"] | None = None,
     ) -> tuple[ControllerState, StepInfo]:
         """One sample; the objective in the info is J + J_u (6.20).
 
         Args:
             state: from `init` or the previous step.
             cv: measurement now, without the further CVs [CV unit].
-            setpoint: held over the horizon [CV unit].
+            setpoint: at j = 1..Hp, or held over the horizon [CV unit].
             mv_target: held over the horizon [MV unit]; entries of MVs without a target are not looked at.
+            mv, manual: as in `ContinuousController.step`.
         """
-        return self.controller.step(state, self._with(cv, state.mv), self._with(setpoint, mv_target))
+        given = checked(self.structure, cv, setpoint, mv, manual)
+        self._check_targets(mv_target)
+        stands = (jnp if isinstance(self.controller, ContinuousController) else np).where(
+            given.mv == given.mv, given.mv, state.position
+        )
+        wide = self._with(given.cv, stands), self._with(given.setpoint, mv_target)
+        return self.controller.step(state, *wide, given.mv, given.manual)
+
+    def _check_targets(self, mv_target: Any) -> None:
+        """Refuse targets of another shape, and those that are not finite where they are looked at."""
+        names = ", ".join(self.structure.mv_names[i] for i in self.targeted)
+        good = np.shape(mv_target) == (self.structure.mv_count,)
+        if good and not isinstance(mv_target, Tracer):
+            good = np.isfinite(np.asarray(mv_target, dtype=np.float64)[list(self.targeted)]).all()
+        if not good:
+            expected = f"{self.structure.mv_count} numbers [MV unit], one per MV, finite for {names}"
+            raise InputError("mv_target", mv_target, expected)
 
     def _with(self, cv, mv):
-        """Values of the CVs, then those of the MVs with a target: on the host where the controller is."""
-        if isinstance(self.controller, ContinuousController):
-            return jnp.concatenate([jnp.asarray(cv), jnp.asarray(mv)[jnp.asarray(self.targeted, dtype=int)]])
-        return np.concatenate([np.asarray(cv), np.asarray(mv)[list(self.targeted)]])
+        """Values of the CVs, over a horizon or not, then those of the MVs with a target; where the controller is."""
+        xp: Any = jnp if isinstance(self.controller, ContinuousController) else np
+        own = xp.asarray(mv)[xp.asarray(self.targeted, dtype=int)]
+        return xp.concatenate(
+            [xp.asarray(cv), xp.broadcast_to(own, (*cv.shape[:-1], len(self.targeted)))], axis=-1
+        )
 
 
 def simulate_with_targets(

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from jaxmpc.batch import Lanes, map_lanes, per_lane, variant_mesh
+from jaxmpc.measurement import received
 from jaxmpc.mixed_integer import MixedIntegerControllers
 from jaxmpc.noise import noise_samples
 from jaxmpc.plant import WellPlant
@@ -22,8 +23,8 @@ REPORT = 20  # samples between two progress reports
 def advance_together(
     controllers: MixedIntegerControllers,
     plants: Lanes[WellPlant],
-    inputs: tuple[np.ndarray, np.ndarray],
-    noise: tuple[np.ndarray, np.ndarray],
+    inputs: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    told: np.ndarray,
     record: Callable[..., dict],
     tick: Callable[[int], None],
 ) -> dict[str, np.ndarray]:
@@ -32,41 +33,48 @@ def advance_together(
     Args:
         controllers: one per scenario.
         plants: one well for all, or one per scenario.
-        inputs: setpoints ``"scenario sample cv"`` and pressure offsets ``"scenario sample"`` [bar].
-        noise: standard deviations ``"scenario cv"`` [CV unit], and seeds with streams ``"scenario 2"``.
+        inputs: setpoints ``"scenario sample cv"``, pressure offsets ``"scenario sample"`` [bar], and noise and faults of the
+            sensors ``"scenario sample cv"`` [CV unit].
+        told: ``"scenario"``, whether the controller is told where the actuators stand.
         record: of ``(cv, mv, state, info)``; the fields to keep by name.
         tick: told how many scenario samples were done.
     """
-    setpoints, offsets = inputs
+    setpoints, offsets, errors, faults = inputs
     count, samples = setpoints.shape[:2]
-    errors = errors_of(*noise, np.arange(samples))
     mesh = variant_mesh(jax.local_devices()[:1])
     at = lambda k: per_lane(np.full(count, k, dtype=np.int32))  # noqa: E731
     state, outputs = map_lanes(_start, [plants, at(0)], mesh)
-    cv = np.asarray(outputs.cv)
-    memory = controllers.init(cv, np.asarray(outputs.mv))
+    cv, mv = np.asarray(outputs.cv), np.asarray(outputs.mv)
+    memory = controllers.init(cv, mv)
     controllers.prepare(memory, cv)
     tick(0)
     fields: dict[str, np.ndarray] = {}
     for k in range(samples):
-        measured = cv + errors[:, k]
-        memory, info = controllers.step(memory, measured, setpoints[:, k])
+        sound = cv + errors[:, k]
+        arrived = received(sound, faults[:, k], np.asarray(memory.sensors.value))
+        memory, info = controllers.step(memory, arrived, setpoints[:, k], np.where(told[:, None], mv, np.nan))
         arguments = [plants, per_lane(state), per_lane(np.asarray(memory.mv)), per_lane(offsets[:, k].copy())]
         state, outputs = map_lanes(WellPlant.step, arguments, mesh)
-        now = record(measured, outputs.mv, memory, info)
+        now = record(sound, outputs.mv, memory, info)
         for name, value in now.items():
             value = np.asarray(value)
             if name not in fields:
                 fields[name] = np.empty((count, samples, *value.shape[1:]), dtype=value.dtype)
             fields[name][:, k] = value
-        cv = np.asarray(outputs.cv)
+        cv, mv = np.asarray(outputs.cv), np.asarray(outputs.mv)
         if (k + 1) % REPORT == 0 or k + 1 == samples:
             tick(count * (k % REPORT + 1))
     return fields
 
 
 def errors_of(deviation: np.ndarray, seeds: np.ndarray, samples: np.ndarray) -> np.ndarray:
-    """Measurement errors ``"scenario sample cv"``; arguments as in `advance_together`."""
+    """Measurement noise ``"scenario sample cv"`` [CV unit].
+
+    Args:
+        deviation: standard deviations ``"scenario cv"`` [CV unit].
+        seeds: seeds with streams ``"scenario 2"``.
+        samples: their numbers.
+    """
     return np.asarray(_errors(deviation, seeds, samples))
 
 

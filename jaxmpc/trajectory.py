@@ -24,12 +24,14 @@ class Trajectory:
     Attributes:
         time: ``"sample"``, start of each sample [s].
         setpoint: ``"sample cv"`` [CV unit].
-        cv: ``"sample cv"``, measured at `time` [CV unit].
+        cv: ``"sample cv"``, measured at `time` by sensors without fault, noise included [CV unit].
         mv_demand: ``"sample mv"``, demand of the controller, held from `time` [MV unit].
         mv: ``"sample mv"``, what the actuators did with it, the step-choke logic included [MV unit].
         move: ``"sample mv"``, demand minus previous demand [MV unit].
         bias: ``"sample cv"``, filtered output bias v(k|k) (6.4) [CV unit].
         bias_raw: ``"sample cv"``, measured minus predicted output (2.31b) [CV unit].
+        quality: ``"sample cv"``, codes of `jaxmpc.measurement.QUALITY`: 0 good, all other measurements were left out.
+        off: ``"sample cv"``, whether the CV was switched off after too many of them.
         status: ``"sample"``, codes of `jaxmpc.status`: 0 optimal, 1 limit, 2 infeasible, 3 failed.
         fallback: ``"sample"``, whether the MVs were held because the solve gave no plan.
         objective: ``"sample"``, objective (6.6) of the applied plan, constants included.
@@ -52,6 +54,8 @@ class Trajectory:
     move: np.ndarray
     bias: np.ndarray
     bias_raw: np.ndarray
+    quality: np.ndarray
+    off: np.ndarray
     status: np.ndarray
     fallback: np.ndarray
     objective: np.ndarray
@@ -104,7 +108,7 @@ AXES = {
         "solve_time",
         "finished_by",
     ),
-    "cv": ("setpoint", "cv", "bias", "bias_raw"),
+    "cv": ("setpoint", "cv", "bias", "bias_raw", "quality", "off"),
     "mv": ("mv_demand", "mv", "move"),
 }
 

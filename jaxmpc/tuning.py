@@ -31,6 +31,13 @@ class Tuning(eqx.Module):
         oscillation_rows: whether an integer MV may not reverse from one sample to the next (6.16).
         bias_cutoff: cut-off of the bias filter (6.4) [rad/s]; infinite means an unfiltered bias.
         mean_move_limit: largest mean move per sample over the window of the structure [MV unit], both directions.
+        measurement_low, measurement_high: a measurement outside is left out, as one that is not a number is [CV unit].
+        frozen_limit: samples in a row without any change after which a measurement is left out; infinite for never.
+        bad_limit: measurements left out in a row after which the CV is switched off; infinite for never.
+        bias_decay: time constant with which the bias of a CV fades while its measurements are left out [s]; infinite
+            keeps it.
+        demand_lead: how far a demand may be from where its actuator stands, where that is told [MV unit]; 0 starts every
+            move from there, a step choke that is asked in small moves needs a step.
     """
 
     cv_weight: Float[Array, " cv"]
@@ -48,10 +55,16 @@ class Tuning(eqx.Module):
     oscillation_rows: Bool[Array, " mv"]
     bias_cutoff: Float[Array, ""]
     mean_move_limit: Float[Array, " mv"]
+    measurement_low: Float[Array, " cv"]
+    measurement_high: Float[Array, " cv"]
+    frozen_limit: Float[Array, " cv"]
+    bad_limit: Float[Array, " cv"]
+    bias_decay: Float[Array, " cv"]
+    demand_lead: Float[Array, " mv"]
 
     def _repr_html_(self) -> str:
         """For notebooks."""
-        return html.tuning(self, UNITS | {"bias_cutoff": "rad/s"}, _DEFAULTS)
+        return html.tuning(self, UNITS | {"bias_cutoff": "rad/s"}, DEFAULTS)
 
 
 CV_FIELDS = (
@@ -62,9 +75,22 @@ CV_FIELDS = (
     "cv_low",
     "cv_high",
     "slack_weight",
+    "measurement_low",
+    "measurement_high",
+    "frozen_limit",
+    "bad_limit",
+    "bias_decay",
 )
-MV_FIELDS = ("move_weight", "mv_low", "mv_high", "move_low", "move_high", "mean_move_limit")
-LIMITS = ("cv_low", "cv_high", "mv_low", "mv_high", "move_low", "move_high", "mean_move_limit")
+MV_FIELDS = ("move_weight", "mv_low", "mv_high", "move_low", "move_high", "mean_move_limit", "demand_lead")
+LIMIT_PAIRS = (
+    ("cv_low", "cv_high"),
+    ("mv_low", "mv_high"),
+    ("move_low", "move_high"),
+    ("measurement_low", "measurement_high"),
+)
+# the least value where a field that may be infinite has one
+LEAST = {"mean_move_limit": 0.0, "demand_lead": 0.0, "frozen_limit": 1.0, "bad_limit": 1.0, "bias_decay": 0.0}
+LIMITS = (*(field for pair in LIMIT_PAIRS for field in pair), *LEAST)
 UNITS = {
     "cv_weight": "1/CV unit^2",
     "move_weight": "1/MV unit^2",
@@ -79,8 +105,14 @@ UNITS = {
     "move_low": "MV unit per sample",
     "move_high": "MV unit per sample",
     "mean_move_limit": "MV unit per sample",
+    "measurement_low": "CV unit",
+    "measurement_high": "CV unit",
+    "frozen_limit": "samples",
+    "bad_limit": "samples",
+    "bias_decay": "s",
+    "demand_lead": "MV unit",
 }
-_DEFAULTS = {
+DEFAULTS = {
     "soft_quadratic": 0.0,
     "soft_linear": 0.0,
     "deadzone": 0.0,
@@ -92,6 +124,12 @@ _DEFAULTS = {
     "move_low": -np.inf,
     "move_high": np.inf,
     "mean_move_limit": np.inf,
+    "measurement_low": -np.inf,
+    "measurement_high": np.inf,
+    "frozen_limit": np.inf,
+    "bad_limit": np.inf,
+    "bias_decay": np.inf,
+    "demand_lead": 0.0,
     "oscillation_rows": False,
     "bias_cutoff": np.inf,
 }
@@ -118,14 +156,14 @@ def make_tuning(structure: Structure, *, path: str = "tuning", **fields) -> Tuni
     values = {}
     for keys, names in ((CV_FIELDS, structure.cv_names), (MV_FIELDS, structure.mv_names)):
         for key in keys:
-            given = fields.get(key, _DEFAULTS.get(key))
+            given = fields.get(key, DEFAULTS.get(key))
             if given is None and key not in LIMITS:
                 raise InputError(
                     f"{path}.{key}", None, f"{len(names)} numbers [{UNITS[key]}] for {', '.join(names)}"
                 )
             values[key] = _vector(f"{path}.{key}", given, names, key)
-    for low, high in (("cv_low", "cv_high"), ("mv_low", "mv_high"), ("move_low", "move_high")):
-        names = structure.cv_names if low == "cv_low" else structure.mv_names
+    for low, high in LIMIT_PAIRS:
+        names = structure.cv_names if low in CV_FIELDS else structure.mv_names
         for i, name in enumerate(names):
             if values[low][i] > values[high][i]:
                 raise InputError(
@@ -174,8 +212,8 @@ def _vector(path: str, given, names: tuple[str, ...], key: str) -> np.ndarray:
             raise InputError(
                 f"{path}[{i}]", value, f"a finite number, 0 or more [{UNITS[key]}] for {names[i]}"
             )
-        if key == "mean_move_limit" and value < 0:
-            raise InputError(f"{path}[{i}]", value, f"0 or more [{UNITS[key]}] for {names[i]}")
+        if key in LEAST and value < LEAST[key]:
+            raise InputError(f"{path}[{i}]", value, f"{LEAST[key]:g} or more [{UNITS[key]}] for {names[i]}")
         out[i] = value
     return out
 

@@ -54,6 +54,7 @@ MEANINGS: dict[str, tuple[tuple[str, ...], str, str]] = {
     "largest_gap": ((), "1", "largest relative gap"),
     "not_optimal": ((), "samples", "samples whose solve did not end optimal"),
     "fallbacks": ((), "samples", "samples with the MVs held for want of a plan"),
+    "bad_measurements": (("cv",), "samples", "measurements that were left out"),
     "wall_time": ((), "s", "time of the whole run"),
 }
 
@@ -102,6 +103,7 @@ INPUTS = (
     "gap",
     "status",
     "fallback",
+    "quality",
     "tuning_deadzone",
     "tuning_cv_low",
     "tuning_cv_high",
@@ -153,6 +155,7 @@ def _figures(run: dict, late, dt: float, windows: int, span: int, choke: int, li
         "largest_gap": kpi.largest_gap(run["gap"]),
         "not_optimal": (run["status"] != 0).sum(),
         "fallbacks": (run["fallback"] != 0).sum(),
+        "bad_measurements": (run["quality"] != 0).sum(axis=0),
     }
 
 

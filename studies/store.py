@@ -36,6 +36,8 @@ VARIABLES: dict[str, tuple[str, str | None, str, Any, str, str]] = {
     "move": ("move", "mv", "f8", np.nan, "move of the demand", "mv_unit"),
     "bias": ("bias", "cv", "f8", np.nan, "filtered output bias v(k|k)", "cv_unit"),
     "bias_raw": ("bias_raw", "cv", "f8", np.nan, "measured minus predicted CV", "cv_unit"),
+    "quality": ("quality", "cv", "i1", -1, "measurement: 0 good, 1 missing, 2 outside, 3 frozen", "1"),
+    "off": ("off", "cv", "i1", -1, "CV switched off after bad measurements", "1"),
     "status": ("status", None, "i1", -1, "status of the solve", "1"),
     "fallback": ("fallback", None, "i1", -1, "MVs held because the solve gave no plan", "1"),
     "objective": ("objective", None, "f8", np.nan, "objective (6.6) of the applied plan", "1"),

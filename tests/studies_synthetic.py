@@ -92,6 +92,8 @@ def trajectory(kind: str, samples: int = 400) -> Trajectory:
         move=np.diff(mv_demand, axis=0, prepend=[[20.0, 7500.0]]),
         bias=cv / 10,
         bias_raw=cv / 9,
+        quality=np.zeros(cv.shape, dtype=int),
+        off=np.zeros(cv.shape, dtype=bool),
         status=np.zeros(samples, dtype=int),
         fallback=np.zeros(samples, dtype=bool),
         objective=np.ones(samples),

@@ -33,6 +33,12 @@ oil_rate = 0.5
 time = 100
 offset = -1.5
 
+[[base.sensor_fault]]
+cv = "oil_rate"
+kind = "missing"
+time = 50
+duration = 40
+
 [[axes]]
 key = "tuning.move_weight.choke"
 values = [100, 200]
@@ -40,13 +46,13 @@ values = [100, 200]
 [[axes]]
 keys = [
   "plant.reservoir_pressure", "model.choke", "seed", "reference", "noise.gas_rate", "disturbance.time",
-  "disturbance.offset",
+  "disturbance.offset", "sensor_fault.time", "position_feedback",
 ]
 values = [
-  [77, 50, 0, "quick", 0, 100, -1.5],
-  [78, 40, 1, "mid-choke", 50, 150, -1.5],
-  [79, 50, 2, "quick", 50, 100, 0],
-  [78.5, 50, 3, "quick", 20, 100, 1],
+  [77, 50, 0, "quick", 0, 100, -1.5, 50, false],
+  [78, 40, 1, "mid-choke", 50, 150, -1.5, 80, true],
+  [79, 50, 2, "quick", 50, 100, 0, 50, true],
+  [78.5, 50, 3, "quick", 20, 100, 1, 120, false],
 ]
 
 [store]

@@ -16,6 +16,8 @@ from jaxmpc.batch import controller_batch, per_lane
 from jaxmpc.closed_loop import simulate, simulate_batch, simulate_batches
 from jaxmpc.controller import ContinuousController
 from jaxmpc.errors import InputError
+from jaxmpc.host_well import HostWell
+from jaxmpc.measurement import MISSING, OUTSIDE, SensorFault, fault_errors
 from jaxmpc.mixed_integer import MixedIntegerController
 from jaxmpc.noise import noise_samples
 from jaxmpc.plant import WellPlant
@@ -271,6 +273,10 @@ def test_several_devices_give_the_results_of_one(lanes, model, tmp_path):
         ({"noise": [1.0, -1.0]}, "noise"),
         ({"disturbance": np.zeros((5, 3))}, "disturbance"),
         ({"disturbance": np.zeros((4, 120))}, "lanes"),
+        ({"faults": np.zeros((4, 120, 2))}, "lanes"),
+        ({"faults": np.zeros((5, 120))}, "faults"),
+        ({"position_feedback": [True, False]}, "lanes"),
+        ({"position_feedback": 1.0}, "position_feedback"),
         ({"samples": 121}, "reference.duration"),
         ({"plants": WellPlant(dt=5.0)}, "plant.dt"),
         ({"controllers": "batched by hand"}, "controllers"),
@@ -291,11 +297,58 @@ def test_a_sweep_that_does_not_fit_is_refused_before_it_starts(lanes, change, fi
     assert error.value.field == field
 
 
+class OnTheHost:
+    """The JAX well as a plant of one's own, so that the loop runs on the host."""
+
+    def __init__(self, plant):
+        self.well, self.dt = HostWell(plant), plant.dt
+
+    def init(self):
+        return self.well.init()
+
+    def step(self, mv, disturbance=0.0):
+        return self.well.step(mv, disturbance)
+
+
+def test_faults_of_sensors_and_told_positions_are_the_same_in_compiled_loops_and_on_the_host(model):
+    structure = presets.structure()
+    changes = {
+        "measurement_low": {"gas_rate": None, "oil_rate": 20.0},
+        "bad_limit": {"gas_rate": 5, "oil_rate": None},
+    }
+    controller = ContinuousController(structure, presets.tuning(structure, changes=changes), model)
+    faults = [
+        SensorFault("gas_rate", "missing", 100.0, 100.0),
+        SensorFault("oil_rate", "frozen", 300.0, 150.0),
+        SensorFault("oil_rate", "spike", 600.0, size=-200.0),
+    ]
+    given = dict(faults=fault_errors(structure, 120, faults), position_feedback=True, noise=[20.0, 0.3])
+    plant = WellPlant(actuator="step")
+    compiled = simulate(controller, plant, TO_30_PERCENT, **given)
+    stepped = simulate(controller, OnTheHost(plant), TO_30_PERCENT, **given)
+    lanes = controller_batch(structure, [controller.tuning] * 2, model)
+    both = {key: np.stack([0 * value, value]) if key == "faults" else value for key, value in given.items()}
+    feedback = {"position_feedback": np.array([False, True]), "seed": np.array([0, 0])}
+    sound, failing = simulate_batch(lanes, plant, TO_30_PERCENT, **(both | feedback))
+    for run in (stepped, failing):
+        np.testing.assert_array_equal(run.quality, compiled.quality)
+        np.testing.assert_array_equal(run.off, compiled.off)
+        np.testing.assert_allclose(run.mv_demand, compiled.mv_demand, **LIMITS)
+    assert compiled.quality[:, 0].tolist() == [MISSING if 10 <= k < 20 else 0 for k in range(120)]
+    assert compiled.quality[:, 1].tolist() == [OUTSIDE if k == 60 else 0 for k in range(120)]
+    assert compiled.off[:, 0].tolist() == [14 <= k < 20 for k in range(120)]
+    assert not sound.quality.any()
+    # without a lead the demand never leaves a step choke by more than one move
+    assert np.abs(compiled.mv_demand[1:, 0] - compiled.mv[:-1, 0]).max() <= 2.0 + 1e-6
+    assert np.abs(sound.mv_demand[1:, 0] - sound.mv[:-1, 0]).max() > 2.0
+
+
 @pytest.mark.parametrize(
     ("change", "field"),
     [
         ({"samples": 121}, "reference.duration"),
         ({"disturbance": np.zeros(3)}, "disturbance"),
+        ({"faults": np.zeros((119, 2))}, "faults"),
         ({"disturbance": np.full(120, np.nan)}, "disturbance"),
         ({"plant": WellPlant(dt=5.0)}, "plant.dt"),
         ({"reference": Reference([0.0], [[1.0]], 100.0)}, "reference.setpoints"),

@@ -50,6 +50,8 @@ def made_up(definition, controller) -> Trajectory:
         move=move,
         bias=0.1 * setpoint,
         bias_raw=0.1 * setpoint,
+        quality=np.zeros(setpoint.shape, dtype=int),
+        off=np.zeros(setpoint.shape, dtype=bool),
         status=np.zeros(samples, dtype=int),
         fallback=np.zeros(samples, dtype=bool),
         objective=flat,

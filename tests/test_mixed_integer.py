@@ -75,23 +75,6 @@ def test_each_of_several_models_does_what_it_does_alone(well_like_model, small_s
         assert together.mv[:, i, 0] == pytest.approx(alone.mv[:, 0], abs=1e-9)
 
 
-def test_a_scenario_without_a_measurement_holds_its_mvs_and_leaves_the_others_alone(
-    well_like_model, small_structure, small_tuning
-):
-    controllers = MixedIntegerControllers(small_structure, [small_tuning], [well_like_model], count=2)
-    cv, mv = (np.repeat(v[None], 2, axis=0) for v in START)
-    state = controllers.init(cv, mv)
-    broken = cv.copy()
-    broken[0, 1] = np.nan
-    state, info = controllers.step(state, broken, cv + np.array([900.0, 6.0]))
-    assert info.fallback.tolist() == [True, False]
-    assert info.status.tolist() == [status.FAILED, status.OPTIMAL]
-    assert info.mv[0] == pytest.approx(START[1])
-    assert np.abs(info.move[1]).max() > 0
-    assert np.isnan(info.objective[0])
-    assert np.isfinite(info.objective[1])
-
-
 @pytest.mark.slow
 def test_time_is_charged_to_the_scenario_that_needs_it(well_like_model, small_structure, small_tuning):
     controllers = MixedIntegerControllers(

@@ -94,6 +94,8 @@ def run():
         move=np.diff(two, axis=0, prepend=two[:1]),
         bias=0 * two,
         bias_raw=0 * two,
+        quality=np.zeros((samples, 2), dtype=int),
+        off=np.zeros((samples, 2), dtype=bool),
         status=np.r_[1, np.zeros(samples - 1, dtype=int)],
         fallback=one > 2,
         objective=one,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from identify.step_test import identify_step_response
-from jaxmpc import closed_loop, status, strides
+from jaxmpc import closed_loop, measurement, status, strides
 from jaxmpc.closed_loop import simulate, simulate_batch
 from jaxmpc.mixed_integer import MixedIntegerController, MixedIntegerControllers
 from jaxmpc.plant import WellPlant
@@ -24,7 +24,8 @@ def model():
 
 def controller(model, blocking="moves", preset="thesis", **options):
     structure = presets.structure(blocking, integer=True)
-    return MixedIntegerController(structure, presets.tuning(structure, preset), model, **options)
+    tuning = presets.tuning(structure, preset, {"measurement_low": {"gas_rate": None, "oil_rate": 20.0}})
+    return MixedIntegerController(structure, tuning, model, **options)
 
 
 def both(monkeypatch, made, **options):
@@ -35,21 +36,34 @@ def both(monkeypatch, made, **options):
         return in_strides, simulate(made, PLANT, REFERENCE, keep_plans=True, **options)
 
 
+FAULTS = (
+    measurement.SensorFault("gas_rate", "missing", 250.0, 100.0),
+    measurement.SensorFault("oil_rate", "frozen", 300.0, 150.0),
+    measurement.SensorFault("oil_rate", "spike", 600.0, size=-200.0),
+)
+
+
 @pytest.mark.parametrize("blocking", ["moves", "inputs"])
 def test_strides_give_the_run_of_single_steps(monkeypatch, model, blocking):
     disturbance = np.where(np.arange(SAMPLES) > 40, -3.0, 0.0)
+    made = controller(model, blocking)
     run, steps = both(
         monkeypatch,
-        controller(model, blocking),
+        made,
         disturbance=disturbance,
         noise=[20.0, 0.3],
         seed=3,
+        faults=measurement.fault_errors(made.structure, SAMPLES, FAULTS),
+        position_feedback=True,
     )
+    assert (run.quality[25:35, 0] == measurement.MISSING).all()
+    assert (run.quality[:, 1] == measurement.OUTSIDE).tolist() == (np.arange(SAMPLES) == 60).tolist()
+    assert np.isfinite(run.cv).all()  # what sensors without fault measure
     assert set(np.unique(steps.finished_by)) >= {status.finisher_code("relaxation")}
     assert (steps.finished_by != status.finisher_code("relaxation")).any(), "no sample was searched"
     for field in (*RECORDABLE, "plan"):
         one, other = getattr(run, field), getattr(steps, field)
-        if field in ("status", "fallback", "nodes", "finished_by"):
+        if field in ("status", "fallback", "nodes", "finished_by", "quality", "off"):
             np.testing.assert_array_equal(one, other, err_msg=field)
         elif field == "gap":
             assert (one <= 1e-6).all()

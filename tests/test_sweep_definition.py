@@ -110,6 +110,36 @@ BAD_BASE = {
         "base.disturbance[0].unit",
         "time, offset",
     ),
+    "a fault of no sensor": (
+        {"sensor_fault": [{"cv": "water_rate", "kind": "missing", "time": 1}]},
+        "base.sensor_fault[0].cv",
+        "gas_rate",
+    ),
+    "a fault of no kind": (
+        {"sensor_fault": [{"cv": "oil_rate", "kind": "lost", "time": 1}]},
+        "base.sensor_fault[0].kind",
+        "frozen",
+    ),
+    "a fault after the run": (
+        {"sensor_fault": [{"cv": "oil_rate", "kind": "missing", "time": 1e5}]},
+        "base.sensor_fault[0].time",
+        "78000 s",
+    ),
+    "a fault that never begins": (
+        {"sensor_fault": [{"cv": "oil_rate", "kind": "missing", "time": 1, "duration": 0}]},
+        "base.sensor_fault[0].duration",
+        "above 0 s",
+    ),
+    "a spike without an end": (
+        {"sensor_fault": [{"cv": "oil_rate", "kind": "spike", "time": 1, "size": float("inf")}]},
+        "base.sensor_fault[0].size",
+        "finite",
+    ),
+    "a limit below the least": (
+        {"tuning": {"bad_limit": {"oil_rate": 0.5}}},
+        "base.tuning.bad_limit.oil_rate",
+        "1 or more",
+    ),
     "a reference that starts late": (
         {"reference": {"times": [10], "setpoints": [[1, 2]], "duration": 20}},
         "base.reference.times[0]",
@@ -175,6 +205,8 @@ def test_combinations_that_only_some_scenarios_have_are_found_before_a_run():
     error = refused(axes=[axis("plant.trip_start", 60, 75), axis("plant.trip_end", 80, 70)])
     assert error.field == "axes[0].values[1] with axes[1].values[1]"
     assert "[bar]" in error.expected
+    error = refused(axes=[axis("sensor_fault.time", 10)])
+    assert "exactly one [[base.sensor_fault]]" in error.expected
     error = refused(axes=[axis("disturbance.time", 10)])
     assert "exactly one [[base.disturbance]]" in error.expected
 
@@ -318,6 +350,9 @@ def test_the_order_of_keys_changes_no_hash_and_every_setting_does():
         {"tuning": {"bias_cutoff": 0.06}},
         {"tuning": {"oscillation_rows": False}},
         {"disturbance": [{"time": 100, "offset": 1}]},
+        {"sensor_fault": [{"cv": "oil_rate", "kind": "missing", "time": 100}]},
+        {"position_feedback": True},
+        {"tuning": {"bad_limit": {"oil_rate": 5}}},
     )
     hashes = [expand({**one, **change}).scenario_hash(0) for change in changes]
     assert len({*hashes, expand(one).scenario_hash(0)}) == len(changes) + 1
@@ -478,7 +513,7 @@ def test_the_page_of_the_documentation_lists_every_key_with_its_unit():
     found = re.findall(r"^\| `([\w.]+)` \| ([^|]*?) ?\|", text, flags=re.M)
     rows = dict(reversed(found))  # the first row of a name is the one of [base]
     for key, field in FIELDS.items():
-        if key.startswith("plant_scale.") or key.startswith("disturbance."):
+        if key.startswith(("plant_scale.", "disturbance.", "sensor_fault.")):
             continue
         shown = rows[key.removeprefix("plant.")]
         assert shown.strip() == field.unit or key == "blocks"

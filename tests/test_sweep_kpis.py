@@ -46,6 +46,8 @@ def batch_of(cv, setpoint, mv, mv_demand, move, **fields) -> TrajectoryBatch:
         objective=np.ones((lanes, samples)),
         gap=np.zeros((lanes, samples)),
         solve_time=np.full((lanes, samples), 1e-3),
+        quality=np.zeros((lanes, samples, 2), dtype=np.int32),
+        off=np.zeros((lanes, samples, 2), dtype=bool),
     )
     return TrajectoryBatch(
         lanes=np.arange(lanes),
@@ -78,6 +80,8 @@ def by_hand() -> TrajectoryBatch:
         gap=1e-7 * (np.arange(12) % 4)[None],
         solve_time=1e-3 * np.arange(1, 13)[None],
         status=np.array([[codes.LIMIT] + [codes.OPTIMAL] * 11]),
+        quality=np.array([[0, 0]] * 7 + [[1, 0], [2, 0], [3, 0], [0, 1], [0, 0]])[None],
+        off=np.array([[False, False]] * 9 + [[True, False]] + [[False, False]] * 2)[None],
     )
 
 
@@ -113,6 +117,8 @@ BY_HAND = {
     "largest_gap": 3e-7,
     "not_optimal": 1,
     "fallbacks": 0,
+    "bad_measurements": [3, 1],
+    "switched_off": [1, 0],
     "finite": 1,
 }
 
@@ -268,7 +274,7 @@ def test_a_sweep_agrees_with_the_comparison_of_the_thesis(tmp_path):
     swept = batch_kpis(batch, tunings, made.REFERENCE.build().window(made.DT))
     swept["integral_absolute_error"] = swept["iae"]
     shared = [name for name in swept if name in compared]
-    assert len(shared) == 17
+    assert len(shared) == 18
     for name in shared:
         np.testing.assert_allclose(swept[name], compared[name].values, rtol=1e-12, err_msg=name)
     np.testing.assert_allclose(swept["hunting_reversals"], compared.late_reversals.sum("window"))

@@ -96,6 +96,8 @@ def alone(scenario, models):
         samples=scenario.samples,
         disturbance=scenario.disturbance,
         noise=scenario.noise,
+        faults=scenario.faults,
+        position_feedback=scenario.position_feedback,
         seed=scenario.seed,
     )
     batch = TrajectoryBatch(

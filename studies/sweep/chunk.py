@@ -83,7 +83,7 @@ def run_chunk(prepared: PreparedStudy, index: int) -> ChunkResult:
     chunk = study.chunks[index]
     group, lanes = study.groups[chunk.group], study.lanes(chunk.group)
     own = group.kind, group.actuator, group.structure, group.samples, group.has_limits, group.whole_steps
-    program = *own, lanes
+    program = *own, group.switching, lanes
     if _program_before != [program]:
         if _program_before:
             forget_programs()  # those of a dozen groups do not fit side by side
@@ -142,8 +142,13 @@ def run_scenarios(
     references = [s.reference for s in filled]
     disturbed = any(s.disturbance is not None for s in filled)
     noisy = any(s.noise is not None for s in filled)
+    failing = any(s.faults is not None for s in filled)
     seeds: Any = np.array([s.seed for s in filled])
-    still, quiet = np.zeros(first.samples), np.zeros(len(CV_NAMES))
+    still, quiet, sound = (
+        np.zeros(first.samples),
+        np.zeros(len(CV_NAMES)),
+        np.zeros((first.samples, len(CV_NAMES))),
+    )
     batches = simulate_batches(
         controllers,
         _plants(filled, plant_fields),
@@ -154,6 +159,8 @@ def run_scenarios(
         else None,
         noise=np.stack([quiet if s.noise is None else s.noise for s in filled]) if noisy else None,
         seed=seeds,
+        faults=np.stack([sound if s.faults is None else s.faults for s in filled]) if failing else None,
+        position_feedback=np.array([s.position_feedback for s in filled]),
         record=tuple(dict.fromkeys((*RECORD, *(f for f in trajectories if f != "setpoint")))),
         lanes_at_once=lanes,
     )

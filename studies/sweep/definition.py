@@ -18,6 +18,7 @@ import msgspec
 from msgspec import UNSET
 
 from jaxmpc.errors import InputError
+from jaxmpc.measurement import FAULTS
 from jaxmpc.well import CV_NAMES
 from studies.sweep.fields import FIELDS, near, similar_end
 from studies.sweep.sections import (
@@ -26,6 +27,7 @@ from studies.sweep.sections import (
     CsvSource,
     Cut,
     Distribution,
+    FaultSection,
     InlineReference,
     PressureStep,
     Quick,
@@ -48,7 +50,7 @@ class StudyDefinition:
         study, axes, sampling, store, quick: the sections of the file.
         search: what is sought along the axes; None for a study that lists its scenarios.
         base: settings by key (`studies.sweep.fields.FIELDS`), only those that are given; besides, ``reference`` may be an
-            `InlineReference` and ``disturbance`` is a tuple of `PressureStep`.
+            `InlineReference`, ``disturbance`` is a tuple of `PressureStep` and ``sensor_fault`` one of `FaultSection`.
         places: path of every axis in the file, for errors.
         folder: that CSV files are relative to.
         body: content of the file, from which `from_dict` makes the same definition again.
@@ -231,6 +233,8 @@ def settings(body: Any, path: str) -> dict[str, Any]:
             below = [known for known in FIELDS if known.startswith(key + ".")]
             if key == "disturbance":
                 out[key] = _disturbance(value, where)
+            elif key == "sensor_fault":
+                out[key] = _sensor_faults(value, where)
             elif key == "reference" and isinstance(value, dict):
                 out[key] = _convert(value, InlineReference, where)
                 out[key].build()
@@ -269,6 +273,17 @@ def _disturbance(value: Any, where: str) -> tuple[PressureStep, ...]:
     return steps
 
 
+def _sensor_faults(value: Any, where: str) -> tuple[FaultSection, ...]:
+    if not isinstance(value, list):
+        raise InputError(where, value, f"faults of sensors, each headed [[{where}]]")
+    faults = tuple(_convert(fault, FaultSection, f"{where}[{i}]") for i, fault in enumerate(value))
+    for i, fault in enumerate(faults):
+        for name in ("time", "duration", "size"):
+            if (given := getattr(fault, name)) is not UNSET:
+                FIELDS[f"sensor_fault.{name}"].check(f"{where}[{i}].{name}", given)
+    return faults
+
+
 _NESTED: dict[str, type[Section]] = {"range": Range, "distribution": Distribution, "csv": CsvSource}
 _EXPECTED = {
     "study.name": "text in quotes, the name of the study",
@@ -288,6 +303,8 @@ _EXPECTED = {
     "kind": "one of uniform, log-uniform, normal",
     "keep": "a list of positions, the first is 0",
     "values": "a list of values",
+    "sensor_fault.cv": f"one of {', '.join(CV_NAMES)}",
+    "sensor_fault.kind": f"one of {', '.join(FAULTS)}",
     "time": "a time [s]",
     "offset": "a change of the reservoir pressure [bar]",
     "times": "a list of times [s]",
@@ -329,4 +346,5 @@ def _convert(body: Any, section: type[T], path: str) -> T:
 
 def _expected(path: str) -> str:
     plain = re.sub(r"\[\d+\]", "", path)
-    return _EXPECTED.get(plain) or _EXPECTED.get(plain.rpartition(".")[2], "")
+    ends = [".".join(plain.split(".")[-parts:]) for parts in (2, 1)]
+    return next((_EXPECTED[end] for end in (plain, *ends) if end in _EXPECTED), "")

@@ -191,6 +191,12 @@ _TUNING_LABELS = {
     "move_low": "largest move down of",
     "move_high": "largest move up of",
     "mean_move_limit": "limit of the mean move of",
+    "measurement_low": "least measurement that counts of",
+    "measurement_high": "largest measurement that counts of",
+    "frozen_limit": "equal measurements in a row that are too many of",
+    "bad_limit": "bad measurements in a row that switch off",
+    "bias_decay": "time constant of the fading bias of",
+    "demand_lead": "how far the demand may lead the position of",
 }
 _SPOKEN = {
     name: "the " + {"gas_lift": "gas lift"}.get(name, name.replace("_", " "))
@@ -201,6 +207,8 @@ _SPOKEN = {
 def _unit(field: str, unit: str) -> str:
     """Unit of a tuning field for a CV or MV of this unit."""
     words = UNITS[field]
+    if words in ("s", "samples"):
+        return words
     short = unit if unit == "%" else f"({unit})"
     if words.startswith("1/"):
         return "1/" + (f"{short}^2" if words.endswith("^2") else unit if unit == "%" else short)
@@ -251,6 +259,10 @@ def _table() -> dict[str, Field]:
         out.append(Field(f"noise.{name}", f"noise of {_SPOKEN[name]}", unit, default=0.0, low=0))
     out += [
         Field("seed", "seed of the noise", "1", "whole", 0, low=0, high=2**32 - 1),
+        Field("sensor_fault.time", "time of the sensor fault", "s", low=0),
+        Field("sensor_fault.duration", "duration of the sensor fault", "s", low=0),
+        Field("sensor_fault.size", "size of the spike", "CV unit"),
+        Field("position_feedback", "predictions from the positions of the actuators", "", "flag", False),
         Field("disturbance.time", "time of the pressure step", "s", low=0),
         Field("disturbance.offset", "step of the reservoir pressure", "bar"),
         Field("reference", "reference", "", "text", "thesis", tuple(references.NAMED), True),

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmpc.errors import InputError
+from jaxmpc.measurement import GOOD
 from jaxmpc.status import OPTIMAL
 from jaxmpc.trajectory import TrajectoryBatch
 from jaxmpc.tuning import CV_FIELDS, MV_FIELDS, Tuning
@@ -35,6 +36,8 @@ RECORD = (  # fields of `Trajectory` that key figures need
     "objective",
     "gap",
     "solve_time",
+    "quality",
+    "off",
 )
 
 
@@ -129,6 +132,14 @@ KPIS: tuple[Kpi, ...] = (
     Kpi("largest_gap", "largest relative gap", "1", "max_k g[k]"),
     Kpi("not_optimal", "samples whose solve did not end optimal", "samples", "count_k(status[k] != 0)"),
     Kpi("fallbacks", "samples with the MVs held for want of a plan", "samples", "count_k(fallback[k])"),
+    Kpi("bad_measurements", "measurements that were left out", "samples", "count_k(quality[k] != 0)", CV),
+    Kpi(
+        "switched_off",
+        "samples with the CV switched off after bad measurements",
+        "samples",
+        "count_k(off[k])",
+        CV,
+    ),
     Kpi("finite", "1 if the run is complete: every CV and MV is finite", "1", "all_k finite(y, r, u, m)"),
 )
 
@@ -140,6 +151,8 @@ ALWAYS = (
     "largest_gap",
     "not_optimal",
     "fallbacks",
+    "bad_measurements",
+    "switched_off",
     "finite",
 )
 
@@ -148,7 +161,7 @@ class Run(NamedTuple):
     """One run as arrays, fields as in `jaxmpc.trajectory.Trajectory`; `runs_of` gives many, lanes first.
 
     Attributes:
-        cv: ``"sample cv"``, measured, noise included.
+        cv: ``"sample cv"``, measured by sensors without fault, noise included.
         setpoint: ``"sample cv"``, at the same time as `cv`.
         mv: ``"sample mv"``, position of the actuators.
         mv_demand: ``"sample mv"``, demand of the controller.
@@ -159,6 +172,8 @@ class Run(NamedTuple):
         solve_time: ``"sample"``, of one controller step [s].
         optimal: ``"sample"``, whether the solve ended optimal.
         fallback: ``"sample"``, whether the MVs were held.
+        left_out: ``"sample cv"``, whether the measurement was bad.
+        off: ``"sample cv"``, whether the CV was switched off.
     """
 
     cv: Any
@@ -172,6 +187,8 @@ class Run(NamedTuple):
     solve_time: Any
     optimal: Any
     fallback: Any
+    left_out: Any
+    off: Any
 
 
 class Channels(NamedTuple):
@@ -225,7 +242,9 @@ def runs_of(batch: TrajectoryBatch, window) -> Run:
             f"whole numbers, one per sample [{shape[1]}] or per lane and sample {list(shape)}",
         )
     numbers = {
-        key: np.asarray(batch[key], dtype=np.float64) for key in RECORD if key not in ("status", "fallback")
+        key: np.asarray(batch[key], dtype=np.float64)
+        for key in RECORD
+        if key not in ("status", "fallback", "quality", "off")
     }
     return Run(
         **numbers,
@@ -233,6 +252,8 @@ def runs_of(batch: TrajectoryBatch, window) -> Run:
         window=np.broadcast_to(labels.astype(np.int32), shape),
         optimal=np.asarray(batch["status"]) == OPTIMAL,
         fallback=np.asarray(batch["fallback"]) != 0,
+        left_out=np.asarray(batch["quality"]) != GOOD,
+        off=np.asarray(batch["off"]) != 0,
     )
 
 
@@ -304,6 +325,8 @@ def run_kpis(
         "largest_gap": kpi.largest_gap(run.gap),
         "not_optimal": (~run.optimal).sum(),
         "fallbacks": run.fallback.sum(),
+        "bad_measurements": run.left_out.sum(axis=0),
+        "switched_off": run.off.sum(axis=0),
         "finite": finite,
     }
     numbers = {name: jnp.asarray(value, dtype=jnp.float64) for name, value in figures.items()}

@@ -111,6 +111,8 @@ def rerun(store: Path, number: int) -> Rerun:
         samples=scenario.samples,
         disturbance=scenario.disturbance,
         noise=scenario.noise,
+        faults=scenario.faults,
+        position_feedback=scenario.position_feedback,
         seed=scenario.seed,
     )
     shown = lambda value: f"{value:g}" if isinstance(value, float) else value  # noqa: E731

@@ -12,13 +12,14 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from msgspec import UNSET
 
 from jaxmpc.errors import InputError
 from jaxmpc.noise import check_deviation, check_seed
 from jaxmpc.plant import check_inputs
 from jaxmpc.reference import Reference
 from jaxmpc.structure import Structure
-from jaxmpc.tuning import CV_FIELDS, LIMITS, MV_FIELDS, make_tuning
+from jaxmpc.tuning import CV_FIELDS, DEFAULTS, LIMIT_PAIRS, LIMITS, MV_FIELDS, make_tuning
 from jaxmpc.well import CV_NAMES, MV_NAMES, WellParameters, check_parameters
 from studies import presets, references
 from studies.sweep.axes import AxisTable
@@ -28,7 +29,6 @@ from studies.sweep.sections import InlineReference
 
 NAMES = {**dict.fromkeys(CV_FIELDS, CV_NAMES), **dict.fromkeys(MV_FIELDS, MV_NAMES)}
 SHAPE_KEYS = tuple(field.key for field in FIELDS.values() if field.shape)
-PAIRS = (("cv_low", "cv_high"), ("mv_low", "mv_high"), ("move_low", "move_high"))
 LISTED = (
     200  # entries of an axis up to which each is checked by itself, instead of the smallest and the largest
 )
@@ -66,6 +66,9 @@ class Inputs:
         noise: ``"scenario cv"``, standard deviation [CV unit].
         seed: ``"scenario"``, of the noise.
         pressure: ``"scenario step 2"``, steps of the reservoir pressure: time [s], offset from then on [bar].
+        fault_kinds: CV and kind of every sensor fault.
+        faults: ``"scenario fault 3"``, time [s], duration [s] and size [CV unit] of the sensor faults.
+        told: ``"scenario"``, whether the controller is told where the actuators stand.
     """
 
     variants: tuple[Variant, ...]
@@ -76,6 +79,9 @@ class Inputs:
     noise: np.ndarray
     seed: np.ndarray
     pressure: np.ndarray
+    fault_kinds: tuple[tuple[str, str], ...]
+    faults: np.ndarray
+    told: np.ndarray
 
 
 def row(array: np.ndarray, k: int) -> np.ndarray:
@@ -141,6 +147,9 @@ def resolve(definition: StudyDefinition, table: AxisTable) -> Inputs:
         noise=_stacked(settings, [f"noise.{name}" for name in CV_NAMES]),
         seed=settings.numbers("seed").astype(np.int64),
         pressure=_pressure(settings, variants, variant),
+        fault_kinds=tuple((fault.cv, fault.kind) for fault in settings.base.get("sensor_fault", ())),
+        faults=_sensor_faults(settings, variants, variant),
+        told=settings.numbers("position_feedback").astype(bool),
     )
     check_inputs(inputs.point[:, 0], inputs.point[:, 1])
     check_deviation(inputs.noise, len(CV_NAMES))
@@ -222,11 +231,11 @@ def _tuning(settings: Settings, integer: np.ndarray) -> dict[str, np.ndarray]:
         columns = []
         for name in names:
             key = f"tuning.{field}.{name}"
-            of_preset = np.array([_number(field, table[field][name]) for table in tables])[preset]
+            of_preset = np.array([_number(field, table, name) for table in tables])[preset]
             columns.append(settings.numbers(key) if settings.given(key) else of_preset)
             _check_tuning_entries(settings, key, field, name)
         out[field] = np.stack(np.broadcast_arrays(*columns), axis=1)
-    for low, high in PAIRS:
+    for low, high in LIMIT_PAIRS:
         smaller, larger = np.broadcast_arrays(out[low], out[high])
         for k, i in np.argwhere(smaller > larger)[:1].tolist():
             name = NAMES[low][i]
@@ -259,8 +268,10 @@ def _without_soft(settings: Settings, out: dict[str, np.ndarray]) -> dict[str, n
     return out
 
 
-def _number(field: str, value: float | None) -> float:
-    return value if value is not None else -np.inf if field.endswith("_low") else np.inf
+def _number(field: str, preset: dict[str, Any], name: str) -> float:
+    """A preset's value of a field, or what holds where it says nothing."""
+    value = preset[field][name] if field in preset else None
+    return DEFAULTS[field] if value is None else value
 
 
 def _check_tuning_entries(settings: Settings, key: str, field: str, name: str | None) -> None:
@@ -360,4 +371,38 @@ def _pressure(settings: Settings, variants: tuple[Variant, ...], variant: np.nda
         path = settings.table.blame(["disturbance.time"], k) if varied else f"base.disturbance[{i}].time"
         expected = f"a time within the run of {durations[variant[k]]:g} s"
         raise InputError(path, float(row(out, k)[i, 0]), expected)
+    return out
+
+
+def _sensor_faults(settings: Settings, variants: tuple[Variant, ...], variant: np.ndarray) -> np.ndarray:
+    """Sensor faults "scenario fault 3"; every one begins within every run."""
+    faults = settings.base.get("sensor_fault", ())
+    keys = [f"sensor_fault.{name}" for name in ("time", "duration", "size")]
+    varied = [key for key in keys if settings.table.column(key) is not None]
+    if varied and len(faults) != 1:
+        path = settings.table.blame(varied[:1], 0)
+        expected = "exactly one [[base.sensor_fault]], whose values the axis replaces"
+        raise InputError(path, f"{len(faults)} faults", expected)
+    dt = variants[0].structure.dt  # one sample where no duration is given
+    given = lambda fault, key: getattr(fault, key.rpartition(".")[2])  # noqa: E731
+    columns = [
+        settings.numbers(key)
+        if key in varied
+        else np.array([dt if given(fault, key) is UNSET else given(fault, key)])
+        for fault in faults
+        for key in keys
+    ]
+    if not columns:
+        return np.zeros((1, 0, 3))
+    out = np.stack(np.broadcast_arrays(*columns), axis=1).reshape(-1, len(faults), 3)
+    durations = np.array([v.reference.duration for v in variants])
+    late = np.broadcast_to(out[:, :, 0] >= durations[variant][:, None], (len(variant), len(faults)))
+    for wrong, key, place, expected in (
+        (late, keys[0], 0, lambda k: f"a time within the run of {durations[variant[k]]:g} s"),
+        (np.broadcast_to(out[:, :, 1] <= 0, late.shape), keys[1], 1, lambda _: "a duration above 0 s"),
+    ):
+        for k, i in np.argwhere(wrong)[:1].tolist():
+            inside = key.replace(".", f"[{i}].")
+            path = settings.table.blame([key], k) if key in varied else f"base.{inside}"
+            raise InputError(path, float(row(out, k)[i, place]), expected(k))
     return out

@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxmpc import html
 from jaxmpc.errors import InputError
+from jaxmpc.measurement import SensorFault, fault_errors
 from jaxmpc.reference import Reference
 from jaxmpc.structure import Structure
 from jaxmpc.trajectory import AXES
@@ -56,6 +57,8 @@ class Scenario:
         noise: standard deviation ``"cv"`` [CV unit]; None without noise.
         seed: of the noise.
         disturbance: offset of the reservoir pressure ``"sample"`` [bar]; None without any.
+        faults: errors of failing sensors ``"sample cv"`` (`jaxmpc.measurement.fault_errors`); None without any.
+        position_feedback: whether the controller is told where the actuators stand.
     """
 
     number: int
@@ -70,6 +73,8 @@ class Scenario:
     noise: np.ndarray | None
     seed: int
     disturbance: np.ndarray | None
+    faults: np.ndarray | None
+    position_feedback: bool
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -80,6 +85,7 @@ class Group:
         kind, actuator, structure, samples: what all of them have.
         has_limits: whether they have a finite CV limit.
         whole_steps: most steps of a whole choke move; 0 for continuous moves.
+        switching: whether bad measurements may switch a CV off.
         points: distinct working points of their models.
         scenarios: their numbers, increasing.
     """
@@ -90,6 +96,7 @@ class Group:
     samples: int
     has_limits: bool
     whole_steps: int
+    switching: bool
     points: tuple[tuple[float, float], ...]
     scenarios: np.ndarray
 
@@ -206,6 +213,8 @@ class Study:
             noise=noise.copy() if noise.any() else None,
             seed=int(row(inputs.seed, k)),
             disturbance=self._disturbance(k),
+            faults=self._faults(k),
+            position_feedback=bool(row(inputs.told, k)),
         )
 
     def scenario_hash(self, k: int) -> str:
@@ -221,6 +230,8 @@ class Study:
             row(inputs.point, k).tolist(),
             [*noise.tolist(), int(row(inputs.seed, k))] if noise.any() else None,  # no noise, no seed
             self._disturbance(k),
+            self._faults(k),
+            bool(row(inputs.told, k)),
         )
 
     @functools.cached_property
@@ -298,6 +309,15 @@ class Study:
         place = np.searchsorted(steps[:, 0], now + 1e-9 * variant.structure.dt, side="right")
         return np.concatenate([[0.0], steps[:, 1]])[place]
 
+    def _faults(self, k: int) -> np.ndarray | None:
+        """Errors of the sensors "sample cv" [CV unit]."""
+        inputs, variant = self._inputs, self._variant(k)
+        if not inputs.fault_kinds:
+            return None
+        numbers = row(inputs.faults, k).tolist()
+        faults = [SensorFault(*kind, *its) for kind, its in zip(inputs.fault_kinds, numbers, strict=True)]  # type: ignore[arg-type]
+        return fault_errors(variant.structure, variant.samples, faults, path="base.sensor_fault")
+
     @functools.cached_property
     def _code(self) -> str:
         return code_hash()
@@ -373,7 +393,8 @@ def _groups(inputs: Inputs, count: int) -> tuple[Group, ...]:
     tuning = inputs.tuning
     limited = np.any(np.isfinite(tuning["cv_low"]) | np.isfinite(tuning["cv_high"]), axis=1)
     reach = np.maximum(-tuning["move_low"][:, 0], tuning["move_high"][:, 0])  # of the choke [%]
-    members: dict[tuple[Any, Any, Any, int, bool, int], list[int]] = {}
+    switching = np.isfinite(tuning["bad_limit"]).any(axis=1)
+    members: dict[tuple[Any, Any, Any, int, bool, int, bool], list[int]] = {}
     for k in range(count):
         variant = inputs.variants[inputs.variant[k]]
         step = variant.structure.integer_step[0]
@@ -386,6 +407,7 @@ def _groups(inputs: Inputs, count: int) -> tuple[Group, ...]:
             variant.samples,
             bool(row(limited, k)),
             steps,
+            bool(row(np.asarray(switching), k)),
         )
         members.setdefault(key, []).append(k)
     groups = []

@@ -8,6 +8,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from jaxmpc.errors import InputError
+from jaxmpc.measurement import FAULTS
 from jaxmpc.reference import Reference
 from jaxmpc.trajectory import AXES
 from jaxmpc.well import CV_NAMES
@@ -139,6 +140,16 @@ class PressureStep(Section, frozen=True):
 
     time: float
     offset: float
+
+
+class FaultSection(Section, frozen=True):
+    """``[[base.sensor_fault]]``: a sensor that fails for a while, as in `jaxmpc.measurement.SensorFault`."""
+
+    cv: Literal[CV_NAMES]  # type: ignore[valid-type]
+    kind: Literal[FAULTS]  # type: ignore[valid-type]
+    time: float
+    duration: float | UnsetType = UNSET
+    size: float = 0.0
 
 
 class InlineReference(Section, frozen=True):
