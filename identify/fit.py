@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.errors import InputError
+from jaxmpc.files import check_target
 from jaxmpc.plant import STATE_SCALE, JaxOps, check_inputs, rates, runge_kutta, steady_state
 from jaxmpc.step_response import FORMAT, StepResponseModel, make_model
 from jaxmpc.well import (
@@ -313,8 +314,8 @@ def main(arguments: list[str] | None = None) -> int:
                     "--gas-rate and --oil-rate", (given.gas_rate, given.oil_rate), "above zero [m3/h]"
                 )
             data = data._replace(rates=np.array([given.gas_rate, given.oil_rate]))
-        if given.out and Path(given.out).is_dir():
-            raise InputError("--out", given.out, "the path of a file")
+        if given.out:
+            check_target("--out", given.out, filter(None, [given.data, given.prior]))
     except InputError as error:
         print(error, file=sys.stderr)
         return 2

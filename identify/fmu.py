@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from identify.fmu_source import MODEL_IDENTIFIER, fmu_files
+from jaxmpc import files
 from jaxmpc.actuator import check_actuator, move_choke
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.files import write_atomically
@@ -37,8 +38,8 @@ STEADY_SAMPLES = 17280  # 48 h
 
 
 def cache_folder() -> Path:
-    """Where built FMUs are kept: ``$JAXMPC_CACHE``, or ``~/.cache/jaxmpc``."""
-    return Path(os.environ.get("JAXMPC_CACHE") or Path.home() / ".cache" / "jaxmpc") / "fmu"
+    """Where built FMUs are kept, see `jaxmpc.files.cache_folder`."""
+    return files.cache_folder("fmu")
 
 
 def build_fmu(

@@ -2,19 +2,24 @@
 
 This is the one module of `jaxmpc` that may import the other packages. Everything heavy is imported inside the
 command that needs it, so that ``--help`` and wrong options answer at once. Bad input ends with one line on
-standard error and exit status 2, a missing tool with status 1; nothing is written in either case.
+standard error and exit status 2, a missing tool with status 1; nothing is written in either case. What the system
+refuses (a full disk, a reader that has left) ends with one line and status 1; faults of the program show themselves.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import json
+import os
+import re
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
 from jaxmpc.errors import InputError, MissingToolError
+from jaxmpc.files import check_target, write_atomically
 from jaxmpc.options import COMPARISONS, parser
 
 EXIT_OPTIMAL, EXIT_OTHER, EXIT_BAD_INPUT, EXIT_INFEASIBLE, EXIT_LIMIT = 0, 1, 2, 3, 4
@@ -31,9 +36,14 @@ def main(arguments: list[str] | None = None) -> int:
         The exit status: 0 done (for `plan`: optimal), 2 bad input with nothing written, 3 infeasible, 4 limit
         reached with a feasible plan, 130 stopped by Ctrl-C, 1 anything else.
     """
-    options = parser(COMMANDS).parse_args(arguments)
+    _provide_standard_streams()
     try:
-        return options.run(options)
+        try:
+            options = parser(COMMANDS).parse_args(arguments)
+            _check_platform()
+            return options.run(options)
+        finally:
+            sys.stdout.flush()  # what cannot be written fails here, and not when the interpreter ends
     except InputError as error:
         return _complain(error, EXIT_BAD_INPUT)
     except MissingToolError as error:
@@ -41,22 +51,60 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("jaxmpc: stopped", file=sys.stderr)
         return EXIT_STOPPED
-    except BrokenPipeError:  # the reader of standard output has left
-        sys.stderr.close()
-        return EXIT_OTHER
+    except OSError as error:  # a full disk, a reader that has left, a name that is too long
+        return _fail(error)
+    except MemoryError as error:
+        return _complain(f"not enough memory: {error}", EXIT_OTHER)
 
 
-def _complain(error: Exception, status: int) -> int:
+def _complain(error: object, status: int) -> int:
     print("jaxmpc: " + " ".join(str(error).split()), file=sys.stderr)
     return status
+
+
+def _fail(error: OSError) -> int:
+    """What the system refused, in one line."""
+    name = error.filename
+    if (
+        name is None
+    ):  # writing to a stream that is open: what is left of it is dropped, or it would fail once more
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+            return _complain(error.strerror or error, EXIT_OTHER)
+        name = "standard output"
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+    return _complain(f"{os.fsdecode(name)}: {error.strerror or error}", EXIT_OTHER)
+
+
+def _provide_standard_streams() -> None:
+    """Streams that were closed by the caller fail when they are written to; any name can be printed on the others."""
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115
+    if sys.stdout is None:
+        sys.stdout = open(os.open(os.devnull, os.O_RDONLY), "w")  # noqa: SIM115
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+def _check_platform() -> None:
+    """Refuse a platform of JAX that this machine does not have."""
+    for name in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME"):
+        if asked := os.environ.get(name):
+            import jax
+
+            try:
+                jax.local_devices()  # of the platform that is used
+            except (RuntimeError, AssertionError):
+                jax.config.update(name.lower(), "")
+                there = ", ".join(sorted({"cpu", jax.default_backend()}))
+                raise InputError(name, asked, f"a platform that this machine has for JAX: {there}") from None
 
 
 def _plan(options: argparse.Namespace) -> int:
     out = getattr(options, "out", None)
     if out is not None:
-        _check_writable("--out", out)
+        check_target("--out", out, [options.case])
     from jaxmpc.case import load_case, plan_to_dict
-    from jaxmpc.files import write_atomically
 
     case = load_case(options.case)
     from jaxmpc.plan import solve_plan
@@ -97,36 +145,18 @@ def _lines(body: dict[str, Any]) -> str:
     return "{\n" + ",\n".join(fields) + "\n}\n"
 
 
-def _check_writable(field: str, path: Path) -> None:
-    """Refuse a file that could not be written later; nothing is left behind."""
-    if path.is_dir():
-        raise InputError(field, str(path), "a file, not a folder")
-    folder = path.absolute().parent
-    while not folder.exists():
-        folder = folder.parent
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise InputError(
-            field, str(path), f"a file in a folder that can be written ({error.strerror})"
-        ) from None
-
-
 def _fmu_build(options: argparse.Namespace) -> int:
     from identify.fmu import build_fmu
 
     out = getattr(options, "out", None)
     if out is not None:
-        _check_writable("--out", out)
+        check_target("--out", out)
     print(build_fmu(fmi=options.fmi, out=out))
     return EXIT_OPTIMAL
 
 
 def _identify(options: argparse.Namespace) -> int:
-    _check_writable("--out", options.out)
-    import contextlib
-
+    check_target("--out", options.out)
     from identify.step_test import identify_step_response, settling_notes
 
     with contextlib.ExitStack() as stack:
@@ -164,7 +194,7 @@ def _study_run(options: argparse.Namespace) -> int:
 
 
 def _study_comparison(options: argparse.Namespace, plant) -> int:
-    _check_writable("--out", options.out / "results")
+    check_target("--out", options.out / "results")
     asked = options.out, options.quick, plant
     if options.study == "claims":
         from studies.claims_study import run_claims
@@ -269,18 +299,17 @@ def _study_export(options: argparse.Namespace) -> int:
 
     suffix = {None: "csv", "netcdf": "nc"}.get(options.kind, options.kind)
     target = options.target or Path(f"{options.store.stem}.{suffix}")
-    _check_writable("FILE", target)
     print(export(options.store, target, options.kind, options.overwrite))
     return EXIT_OPTIMAL
 
 
 def _simulate(options: argparse.Namespace) -> int:
     store, mark, number = options.scenario.rpartition("#")
-    if not mark or not number.isdigit():
+    if not mark or not re.fullmatch("[0-9]{1,18}", number):
         raise InputError(
             "scenario", options.scenario, "a store and a number, such as results/deadzone.zarr#12"
         )
-    _check_writable("--out", options.out / "run")
+    check_target("--out", options.out / "run")
     import warnings
 
     from studies.sweep.rerun import rerun
@@ -307,7 +336,7 @@ def _figures(options: argparse.Namespace) -> int:
         for id, entry in FIGURES.items():
             print(f"{id:>8}  {entry.title}  ({entry.study or 'no study'})")
         return EXIT_OPTIMAL
-    _check_writable("--out", options.out / "figure")
+    check_target("--out", options.out / "figure")
     from figures.gallery import write_gallery
     from figures.produce import produce
 
@@ -328,9 +357,9 @@ def _bench(options: argparse.Namespace) -> int:
     only = getattr(options, "only", None)
     out, folder = getattr(options, "json", None), getattr(options, "figures", None)
     if out is not None:
-        _check_writable("--json", out)
+        check_target("--json", out)
     if folder is not None:
-        _check_writable("--figures", folder / "figure")
+        check_target("--figures", folder / "figure")
     from studies.bench.run import run_bench, table, wrong
 
     report = run_bench(quick=options.quick, only=only, json_path=out)

@@ -1,34 +1,206 @@
-"""Files are replaced in one go or not at all: a crash leaves the previous content."""
+"""Files that are written, the one place where that happens: a regular file is replaced in one go or not at all, a link
+is followed, a pipe or a character device is written to. `check_target` refuses beforehand what could not be written.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
+import secrets
+import stat
+import sys
 import tempfile
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
+from jaxmpc.errors import InputError
 
-def write_atomically(path: str | Path, content: str | bytes) -> Path:
-    """Write `content` to a temporary neighbour, flush it to disk, and rename it over `path`.
+Content = str | bytes | Callable[[str], object]
+
+
+def write_atomically(path: str | Path, content: Content) -> Path:
+    """Write a file so that a crash or a full disk leaves the previous content.
+
+    A regular file gets a new content by a rename: mode and, as far as permitted, owner stay, other hard links keep the
+    old content. A new file has the mode of the umask. A link stays and what it names is written. A pipe or a
+    character device stays and receives the content.
 
     Args:
-        path: target file; its folder is made if missing.
-        content: text (UTF-8) or bytes.
+        path: target; missing folders are made.
+        content: text (UTF-8), bytes, or a function that writes the file whose path it is given.
 
     Returns:
-        The path written.
+        The path that was given.
+
+    Raises:
+        OSError: if the target cannot be written; one without any write permission (mode 0444) is not replaced.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    data = content.encode() if isinstance(content, str) else content
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+        known = _status(path)
+        if known is not None:
+            _refuse_kind(path, known)
+        if known is None or stat.S_ISREG(known.st_mode):
+            _replace(Path(os.path.realpath(path)), content, known)
+        else:
+            _send(path, content)
+    except OSError as error:  # names the file that was asked for, not its temporary neighbour
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
     return path
+
+
+def check_target(field: str, path: str | Path, inputs: Iterable[str | Path] = ()) -> None:
+    """Refuse a file that could not be written later; nothing is left behind and nothing is opened.
+
+    Args:
+        field: name of the option, for the error.
+        path: what is to be written.
+        inputs: files that are read, or folders that are read from; the target may not be one of them or inside.
+
+    Raises:
+        InputError: naming the path and the reason.
+    """
+    path = Path(path)
+    try:
+        known = _status(path)
+        if known is not None:
+            _refuse_kind(path, known)
+        for given in inputs:
+            _refuse_input(path, known, Path(given))
+        if known is None or stat.S_ISREG(known.st_mode):
+            _probe(Path(os.path.realpath(path)))
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(field, str(path), f"a file that can be written ({reason})") from None
+
+
+def cache_folder(kind: str) -> Path:
+    """Where the cache of this kind is: in ``$JAXMPC_CACHE`` or ``~/.cache/jaxmpc``.
+
+    Without a home directory that can be written, it is a private folder among the temporary files, which one line on
+    standard error says.
+    """
+    if given := os.environ.get("JAXMPC_CACHE"):
+        return Path(given) / kind
+    try:
+        home = Path.home() / ".cache" / "jaxmpc"
+        if os.access(_existing(home), os.W_OK | os.X_OK):
+            return home / kind
+        problem = f"{home} cannot be written"
+    except (
+        RuntimeError,
+        OSError,
+    ) as error:  # no $HOME and no entry in the password database, or no such folder
+        problem = str(error)
+    folder = _private_folder()
+    if folder not in _SAID:
+        _SAID.add(folder)
+        print(f"jaxmpc: the cache is in {folder} ({problem}; JAXMPC_CACHE moves it)", file=sys.stderr)
+    return folder / kind
+
+
+_SAID: set[Path] = set()
+
+
+def _private_folder() -> Path:
+    """A folder for temporary files that nobody else may write; the same for every process of a user."""
+    folder = Path(tempfile.gettempdir()) / f"jaxmpc-{os.getuid() if hasattr(os, 'getuid') else 'cache'}"
+    with contextlib.suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    found = folder.lstat()
+    mine = not hasattr(os, "getuid") or found.st_uid == os.getuid()
+    if stat.S_ISDIR(found.st_mode) and mine and not found.st_mode & 0o022:
+        return folder
+    return Path(tempfile.mkdtemp(prefix="jaxmpc-"))
+
+
+def _status(path: Path) -> os.stat_result | None:
+    """Of what the path names, links followed; None if there is nothing."""
+    try:
+        return os.stat(path)
+    except FileNotFoundError:
+        return None
+
+
+def _refuse_kind(path: Path, known: os.stat_result) -> None:
+    """Folders, disks and sockets, and files whose permissions say that they are not to be written."""
+    mode = known.st_mode
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, "it is a folder", str(path))
+    if not (stat.S_ISREG(mode) or stat.S_ISFIFO(mode) or stat.S_ISCHR(mode)):
+        raise OSError(errno.EINVAL, "it is neither a file, a pipe nor a character device", str(path))
+    if not mode & 0o222 or not os.access(path, os.W_OK):
+        reason = f"its mode {stat.S_IMODE(mode):04o} does not let it be written"
+        raise PermissionError(errno.EACCES, reason, str(path))
+
+
+def _refuse_input(path: Path, known: os.stat_result | None, given: Path) -> None:
+    """The file that is read, also by another name; a terminal may be both."""
+    source = _status(given)
+    if source is None:
+        return
+    if known is not None and os.path.samestat(known, source) and not stat.S_ISCHR(known.st_mode):
+        raise OSError(errno.EINVAL, "it is the input", str(path))
+    if stat.S_ISDIR(source.st_mode) and Path(os.path.realpath(path)).is_relative_to(os.path.realpath(given)):
+        raise OSError(errno.EINVAL, f"it is inside the input {given}", str(path))
+
+
+def _existing(folder: Path) -> Path:
+    """The folder, or the nearest one above it that exists."""
+    while not os.path.lexists(folder):
+        folder = folder.parent
+    return folder
+
+
+def _probe(target: Path) -> None:
+    """Raise what would prevent a new file with this name."""
+    folder = _existing(target.parent)
+    with tempfile.TemporaryFile(dir=folder):
+        pass
+    longest = os.pathconf(folder, "PC_NAME_MAX") if hasattr(os, "pathconf") else 255
+    if any(len(os.fsencode(part)) > longest for part in target.relative_to(folder).parts):
+        raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), str(target))
+
+
+def _replace(target: Path, content: Content, known: os.stat_result | None) -> None:
+    """Write a temporary neighbour, flush it to the disk, and rename it over the target."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    # a short name of its own: the target's may be as long as a name can be
+    temporary = target.with_name(f".{target.name[:32]}.{secrets.token_hex(6)}")
+    mode = 0o666 if known is None else 0o600  # the system takes the umask off
+    os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode))
+    try:
+        _fill(temporary, content)
+        with open(temporary, "rb+") as file:
+            os.fsync(file.fileno())
+        if known is not None:
+            _keep_owner_and_mode(temporary, known)
+        os.replace(temporary, target)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def _fill(path: Path, content: Content) -> None:
+    if callable(content):
+        content(str(path))
+    else:
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def _keep_owner_and_mode(path: Path, known: os.stat_result) -> None:
+    if hasattr(os, "chown"):
+        with contextlib.suppress(PermissionError):  # only the superuser may give files away
+            os.chown(path, known.st_uid, known.st_gid)
+    os.chmod(path, stat.S_IMODE(known.st_mode))
+
+
+def _send(path: Path, content: Content) -> None:
+    """Write to a pipe or a character device, which can be neither sought in nor renamed over."""
+    if callable(content):
+        with tempfile.TemporaryDirectory(prefix="jaxmpc-") as folder:
+            whole = Path(folder, "content")
+            content(str(whole))
+            content = whole.read_bytes()
+    _fill(path, content)

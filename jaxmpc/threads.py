@@ -25,7 +25,7 @@ def cores() -> int:
     if jax.default_backend() != "cpu":
         return 1
     given = os.environ.get(THREADS, "")
-    return max(int(given), 1) if given.isdigit() else len(os.sched_getaffinity(0))
+    return max(int(given), 1) if given.isdecimal() else len(os.sched_getaffinity(0))
 
 
 def parts_of(count: int, most: int) -> list[np.ndarray]:

@@ -135,8 +135,20 @@ def test_figures_never_solve(path):
 
 
 def test_the_command_line_imports_nothing_heavy_before_a_command_asks_for_it():
-    light = {"__future__", "argparse", "collections", "json", "pathlib", "sys", "tempfile", "typing"}
-    own = ("jaxmpc.errors.", "jaxmpc.options.")
+    light = {
+        "__future__",
+        "argparse",
+        "collections",
+        "contextlib",
+        "io",
+        "json",
+        "os",
+        "pathlib",
+        "re",
+        "sys",
+    }
+    light |= {"typing"}
+    own = ("jaxmpc.errors.", "jaxmpc.files.", "jaxmpc.options.")
     for path in (ROOT / COMPOSITION_ROOT, ROOT / "jaxmpc/options.py"):
         for name, on_import in imports(path):
             assert not on_import or name.split(".")[0] in light or name.startswith(own), name

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import io
-import os
 import time
 import zipfile
 from collections.abc import Callable
@@ -21,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmpc import files
 from jaxmpc.case import Case, case_to_dict
 from jaxmpc.closed_loop import simulate
 from jaxmpc.controller import ContinuousController
@@ -45,8 +45,8 @@ FIELDS = ("setpoint", "cv", "move", "mv_demand", "gap", "fallback", "solve_time"
 
 
 def cache_folder() -> Path:
-    """Where recordings are kept: ``$JAXMPC_CACHE``, or ``~/.cache/jaxmpc``."""
-    return Path(os.environ.get("JAXMPC_CACHE") or Path.home() / ".cache" / "jaxmpc") / "bench"
+    """Where recordings are kept, see `jaxmpc.files.cache_folder`."""
+    return files.cache_folder("bench")
 
 
 @dataclasses.dataclass(frozen=True)

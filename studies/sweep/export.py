@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import importlib.util
-import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
 from jaxmpc.errors import InputError, MissingToolError
+from jaxmpc.files import check_target, write_atomically
 from studies.sweep.reading import kpi_frame, open_study
+from studies.sweep.records import store_path
 
 FORMATS = {".csv": "csv", ".parquet": "parquet", ".nc": "netcdf"}
 _INT32 = np.iinfo(np.int32)
 
 
 def export(path: str | Path, target: str | Path, format: str | None = None, overwrite: bool = False) -> Path:
-    """Write the results of a study to a file, in one rename.
+    """Write the results of a study to a file, in one go.
 
     ``csv`` and ``parquet`` hold a row for each scenario with columns and key figures (`kpi_frame`); ``parquet``
     needs pyarrow. ``netcdf`` holds everything that `open_study` gives as netCDF 3 with 64-bit offsets, which any
@@ -47,7 +47,8 @@ def export(path: str | Path, target: str | Path, format: str | None = None, over
             str(target) if format is None else format,
             f"a file ending in {', '.join(FORMATS)}, or one of the formats {', '.join(FORMATS.values())}",
         )
-    if target.is_dir() or (target.exists() and not overwrite):
+    check_target("target", target, [store_path(path)])
+    if target.is_file() and not overwrite:
         raise InputError(
             "target",
             str(target),
@@ -63,29 +64,15 @@ def export(path: str | Path, target: str | Path, format: str | None = None, over
     else:
         table = kpi_frame(path)
 
-    temporary = None
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
-        os.close(handle)
+    def content(temporary: str) -> None:
         if kind == "csv":
             table.to_csv(temporary)
         elif kind == "parquet":
             table.to_parquet(temporary, engine="pyarrow")
         else:
             data.to_netcdf(temporary, engine="scipy", format="NETCDF3_64BIT")
-        with open(temporary, "rb+") as file:
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, target)
-    except OSError as error:
-        raise InputError(
-            "target", str(target), f"a file that can be written ({error.strerror or error})"
-        ) from error
-    finally:
-        if temporary is not None:
-            Path(temporary).unlink(missing_ok=True)
-    return target
+
+    return write_atomically(target, content)
 
 
 def _netcdf_ready(data: xr.Dataset) -> xr.Dataset:

@@ -12,6 +12,7 @@ import xarray as xr
 from jaxmpc.closed_loop import simulate
 from jaxmpc.controller import ContinuousController
 from jaxmpc.errors import InputError
+from jaxmpc.files import write_atomically
 from jaxmpc.mixed_integer import MixedIntegerController
 from jaxmpc.plant import WellPlant
 from jaxmpc.trajectory import AXES, Trajectory
@@ -59,10 +60,8 @@ class Rerun:
             "cv": ("cv", list(t.cv_names)),
             "mv": ("mv", list(t.mv_names)),
         }
-        folder.mkdir(parents=True, exist_ok=True)
-        target = folder / "trajectory.nc"
-        xr.Dataset(fields, coords, {"title": self.title}).to_netcdf(target, engine="scipy")
-        return target
+        data = xr.Dataset(fields, coords, {"title": self.title})
+        return write_atomically(folder / "trajectory.nc", lambda path: data.to_netcdf(path, engine="scipy"))
 
 
 def study_of(store: Path) -> Study:
