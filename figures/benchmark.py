@@ -50,7 +50,7 @@ def draw_benchmark(results: str | Path | dict[str, Any], out: str | Path) -> lis
 def _load(path: Path) -> dict[str, Any]:
     try:
         return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(
             "benchmark results", str(path), f"a file of `jaxmpc bench --json` ({error})"
         ) from None

@@ -121,7 +121,7 @@ def load_step_data(path: str | Path) -> StepData:
     """
     try:
         body = json.loads(Path(path).read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError("step-response file", str(path), f"a readable JSON file ({error})") from error
     if not isinstance(body, dict):
         raise InputError("step-response file", str(path), "a JSON object")

@@ -5,16 +5,18 @@ Every node tightens its limits by what its own prices exclude (`levelset`) and b
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import itertools
 
 import numpy as np
 
 from jaxmpc.levelset import LowerModel, exclude
-from jaxmpc.propagation import propagate, satisfied
+from jaxmpc.propagation import UndecidedError, propagate, satisfied
 from jaxmpc.relaxer import Relaxations
 from jaxmpc.search import GROUP, Search, Steps
 
+HELD = 2**27  # prices of whole moves that open nodes may keep, a gigabyte
 MANY, BATCH = 64, 64  # nodes from which whole batches are solved, and their size
 
 
@@ -32,7 +34,7 @@ def branch_and_bound(
         if heap[0][0] >= search.cutoff:
             search.discard(heap[0][0])
             return np.inf
-        if search.out_of_time():
+        if search.out_of_time() or len(heap) * heap[0][4].excess.size > HELD:
             return heap[0][0]
         children = []
         width = GROUP if search.nodes < MANY or len(lower) > MANY else BATCH
@@ -64,7 +66,8 @@ def branch_and_bound(
                     search.discard(float(min(bounds[i], result.snapped[i])))
             elif bounds[i] < search.cutoff:
                 search.offer(result, i)
-                candidates.append(search.rounded(result.x[i, c.integer], low[i], high[i]))
+                with contextlib.suppress(UndecidedError):
+                    candidates.append(search.rounded(result.x[i, c.integer], low[i], high[i]))
         points = search.new(candidates)[:GROUP]
         if len(points):
             yield from search.evaluate(points)

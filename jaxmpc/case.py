@@ -24,10 +24,11 @@ from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
 from jaxmpc.gap import check_gap, check_time_limit
 from jaxmpc.step_response import StepResponseModel, make_model
-from jaxmpc.structure import Structure
+from jaxmpc.structure import LARGEST, Structure, sound
 from jaxmpc.tuning import UNITS, Tuning, make_tuning
 
 DEFAULT_GAP = 1e-6
+LARGEST_FILE = 64 * 2**20  # bytes; a hundred thousand samples of four CVs take 10 MiB
 LONGEST_HORIZON = 100_000  # samples; beyond it the file is wrong, and memory runs out before any other check
 
 
@@ -159,9 +160,13 @@ def load_case(path: str | Path) -> Case:
         InputError: for a file that cannot be read, text that is not JSON, and everything `make_case` refuses.
     """
     try:
-        text = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError("case file", str(path), f"a readable file ({error.strerror or error})") from error
+        with open(path, "rb") as file:
+            text = file.read(LARGEST_FILE + 1)
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError("case file", str(path), f"a readable file ({reason})") from error
+    if len(text) > LARGEST_FILE:
+        raise InputError("case file", str(path), f"a file of {LARGEST_FILE // 2**20} MiB at most")
     try:
         body = json.loads(text, object_pairs_hook=_without_repeats)
     except InputError:
@@ -332,6 +337,7 @@ def _at(body: Any, path: str) -> Any:
 
 
 def _join(path: str, name: str) -> str:
+    name = name or '""'
     return f"{path}.{name}" if path else name
 
 
@@ -383,10 +389,11 @@ def _table(path: str, given: list[list[float]], rows: int, why: str, names: tupl
 
 
 def _finite(path: str, array: np.ndarray) -> np.ndarray:
-    bad = np.argwhere(~np.isfinite(array))
+    bad = np.argwhere(~sound(array))
     if len(bad):
         index = "".join(f"[{i}]" for i in bad[0])
-        raise InputError(path + index, float(array[tuple(bad[0])]), f"a finite number{_unit(path)}")
+        expected = f"a finite number of size {LARGEST:g} at most{_unit(path)}"
+        raise InputError(path + index, float(array[tuple(bad[0])]), expected)
     array.setflags(write=False)
     return array
 

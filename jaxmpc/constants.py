@@ -7,9 +7,16 @@ import numpy as np
 
 from jaxmpc.blocking import hard_rows
 from jaxmpc.condense import CondensedQp, integer_columns
+from jaxmpc.errors import InputError
 from jaxmpc.levelset import assignment_order, leading_factor, root_factor, schur_complement
 from jaxmpc.relaxation import cold_start
 from jaxmpc.structure import Structure
+
+
+def _check_finite(qp: CondensedQp) -> None:
+    for values in (qp.hessian, qp.curvature, qp.scale, qp.row_size, qp.bend, qp.reach):
+        if not np.isfinite(values).all():
+            raise FloatingPointError
 
 
 class Constants:
@@ -23,10 +30,20 @@ class Constants:
         self.integer = integer_columns(structure)
         self.scales = np.asarray(qp.scale)  # MV units per unit of x
         hessian = np.asarray(qp.hessian)
-        self.schur, self.radius = schur_complement(hessian, self.integer)
-        self.root_factor = root_factor(self.schur)
         self.order = assignment_order(structure.block_count, len(structure.integer_mvs))
-        self.leading = leading_factor(self.schur[np.ix_(self.order, self.order)])
+        try:
+            with np.errstate(over="raise", invalid="raise"):
+                _check_finite(qp)
+                self.schur, self.radius = schur_complement(hessian, self.integer)
+                self.root_factor = root_factor(self.schur)
+                self.leading = leading_factor(self.schur[np.ix_(self.order, self.order)])
+        except (FloatingPointError, np.linalg.LinAlgError):
+            raise InputError(
+                "tuning",
+                "weights and step responses of very different sizes",
+                "numbers whose products are finite [CV unit, MV unit]",
+                "Check cv_weight, move_weight, soft_quadratic, the model's coefficients and the integer steps",
+            ) from None
         self.slope = np.asarray(qp.soft_linear)[predictions:]  # of the envelope rows
         self.knot = np.asarray(qp.deadzone)[predictions:]
         self.levels = len(self.slope) // max(len(self.integer), 1)

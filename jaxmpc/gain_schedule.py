@@ -100,7 +100,7 @@ class ModelSchedule(eqx.Module):
         """Read a schedule written by `save`. Raises `InputError` naming the field that is wrong."""
         try:
             body = json.loads(Path(path).read_text())
-        except (OSError, json.JSONDecodeError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise InputError("schedule file", str(path), f"a readable JSON file ({error})") from error
         return cls.from_dict(body)
 

@@ -7,10 +7,39 @@ of R from solved problems bound the rest from below (outer approximation, Duran 
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import os
+import threading
+
 import highspy
 import numpy as np
 
 from jaxmpc.propagation import Chain
+
+_FIRST = threading.Lock()
+
+
+def _silent_highs() -> highspy.Highs:
+    """A solver that prints nothing."""
+    with _FIRST:
+        _swallow_greeting()
+    highs = highspy.Highs()
+    highs.setOptionValue("output_flag", False)
+    return highs
+
+
+@functools.cache
+def _swallow_greeting() -> None:
+    """The first solver of a process writes its version to standard output, past any option."""
+    with contextlib.ExitStack() as stack, contextlib.suppress(OSError):  # standard output may be closed
+        kept = os.dup(1)
+        stack.callback(os.close, kept)
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        stack.callback(os.close, nowhere)
+        os.dup2(nowhere, 1)
+        stack.callback(os.dup2, kept, 1)
+        highspy.Highs()
 
 
 class ReducedMilp:
@@ -30,9 +59,8 @@ class ReducedMilp:
         self.free = np.flatnonzero(upper > lower)
         self.base = float(sum(own[i, 0] for i in range(len(lower)))) / unit
         self.first_column = {}
-        highs = self.highs = highspy.Highs()
+        highs = self.highs = _silent_highs()
         for option, value in (
-            ("output_flag", False),
             ("threads", 1),
             ("mip_rel_gap", 1e-9),
             ("mip_abs_gap", 1e-10),
@@ -182,8 +210,7 @@ def solve_qp(
     Returns:
         ``(status, x)``: ``optimal``, ``limit``, ``infeasible`` or ``failed``, and the point where it is optimal.
     """
-    highs = highspy.Highs()
-    highs.setOptionValue("output_flag", False)
+    highs = _silent_highs()
     if seconds is not None:
         highs.setOptionValue("time_limit", float(seconds))
     columns = A.tocsc()
@@ -241,9 +268,8 @@ def solve_milp(
         ``(status, x, bound)``: ``optimal``, ``limit``, ``infeasible`` or ``failed``; the best point, None without one;
         the proven lower bound of the cost.
     """
-    highs = highspy.Highs()
+    highs = _silent_highs()
     for option, value in (
-        ("output_flag", False),
         ("threads", 1),
         ("mip_rel_gap", gap),
         ("mip_abs_gap", 1e-10),

@@ -26,7 +26,7 @@ from jaxmpc.gap import closes
 from jaxmpc.levelset import LowerModel, enumerate_below, exclude
 from jaxmpc.newton import WarmStart
 from jaxmpc.outer_approximation import outer_approximation
-from jaxmpc.propagation import propagate, satisfied
+from jaxmpc.propagation import UndecidedError, propagate, satisfied, whole
 from jaxmpc.relaxer import Relaxations, Relaxer
 from jaxmpc.scheduling import run
 from jaxmpc.search import GROUP, Search, SearchResult, Steps
@@ -181,16 +181,18 @@ def _line(search: Search, starts: list[np.ndarray], finish: str) -> Steps:
     """The whole line of one solve, from its relaxation on; returns `SearchResult`."""
     c, root, root_bound = search.constants, search.root, search.root_bound
     integer = c.integer
-    low = np.round(search.limits[0][integer]).astype(int)
-    high = np.round(search.limits[1][integer]).astype(int)
+    low, high = whole(search.limits[0][integer]), whole(search.limits[1][integer])
     infeasible = SearchResult(None, np.inf, np.inf, INFEASIBLE, None, 0)
     if not (np.isfinite(root.x).all() and np.isfinite(root.bound).all()):
         return search.finish(None, root_bound)
     model, lower, upper = search.lower_model(root, 0, low, high), low, high
-    point = np.clip(np.round(model.center), low, high).astype(int)
+    point = np.clip(whole(model.center), low, high)
     if not satisfied(search.chains, point[None], low, high)[0]:
         lower, upper, possible = (part[0] for part in propagate(search.chains, low[None], high[None]))
-        point = _repaired(search, model, lower, upper) if possible else None
+        try:
+            point = _repaired(search, model, lower, upper) if possible else None
+        except UndecidedError:
+            return search.finish(None, root_bound)
         if point is None:
             return infeasible
     cuts = Cuts(c)
@@ -268,7 +270,7 @@ def _candidates(
     search: Search, model: LowerModel, starts: list[np.ndarray], lower: np.ndarray, upper: np.ndarray
 ) -> list[np.ndarray]:
     """Whole moves that may be good: starts, no moves, and the best by the model."""
-    simple = [np.clip(np.round(w), lower, upper).astype(int) for w in (*starts, np.zeros(len(lower)))]
+    simple = [np.clip(whole(w), lower, upper) for w in (*starts, np.zeros(len(lower)))]
     fit = [point for point in simple if satisfied(search.chains, point[None], lower, upper)[0]]
     return (fit + list(_best_by_model(search, model, lower, upper)))[:GROUP]
 

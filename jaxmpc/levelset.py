@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 from jaxmpc.propagation import Chain, satisfied
 
 GRID = 1024  # combinations up to which all are evaluated at once
+CELLS = 2**24  # partial assignments times values of the next move that are looked at together
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +120,8 @@ def enumerate_below(
         chains: hard rows, checked as far as the assigned blocks allow.
         lower, upper: limits of the moves, within the model's.
         cutoff: moves with a bound at or above it are left out.
-        most: give up (return None) when more partial assignments than this are alive at once; None for no limit.
+        most: give up (return None) when more partial assignments than this are alive at once; None for as many as
+            fit into memory.
         beam: keep only so many partial assignments of least bound, to find good moves rather than all.
 
     Returns:
@@ -137,6 +139,11 @@ def enumerate_below(
     for i, (k, b) in enumerate(owners):
         chain, column = chains[k], model.order[i]
         domain = np.arange(int(lower[column]), int(upper[column]) + 1)
+        if len(bounds) * len(domain) > CELLS:
+            if beam is None:
+                return None
+            best = np.argsort(bounds, kind="stable")[: max(CELLS // len(domain), 1)]
+            moves, bounds, position = moves[best], bounds[best], position[best]
         row, center = model.leading[i], model.center[model.order]
         own = model.excess[column, domain - model.lower[column]]
         term = (moves @ row[:i] - row[: i + 1] @ center[: i + 1])[:, None] + row[i] * domain

@@ -21,6 +21,7 @@ from jaxmpc.search import GROUP, Offload, Search, Steps
 LISTED = 2_000  # candidates the tangents are chosen by
 BEAM = 256  # partial candidates kept where the list would be longer
 TANGENTS = 64  # added between two master problems at most
+WIDEST = 20_000  # binaries of a master, one for every value of a free move
 
 
 def outer_approximation(
@@ -36,6 +37,8 @@ def outer_approximation(
         upper: the same.
         seconds: time limit from here on, None for none.
     """
+    if (upper - lower).sum() > WIDEST:
+        return False, search.root_bound
     from jaxmpc.highs import ReducedMilp  # HiGHS is loaded when it is first needed
 
     c = search.constants

@@ -30,7 +30,7 @@ from jaxmpc.sample import require_double_precision
 from jaxmpc.search import SearchResult
 from jaxmpc.step_response import StepResponseModel, check_match
 from jaxmpc.step_solver import StepSolver
-from jaxmpc.structure import Structure, check_vector
+from jaxmpc.structure import LARGEST, Structure, check_vector, sound
 from jaxmpc.tuning import Tuning
 
 
@@ -113,8 +113,8 @@ class Planner:
         check_match(structure, model)
         self.structure, self.tuning, self.model = structure, tuning, model
         self._numbers = jax.tree.map(np.asarray, tuning)
+        self.solver = StepSolver(structure, [tuning], [model])  # refuses what is too large
         self.matrix = np.asarray(dynamic_matrix(structure, model.coefficients))
-        self.solver = StepSolver(structure, [tuning], [model])
         self._packings: dict[tuple[bool, Packing], Packing] = {}
         self._started = False
         self._flat: Any = None
@@ -360,9 +360,11 @@ def solve_plan(
     for path, value in (("free_response", free_response), ("setpoint", setpoint)):
         array = np.asarray(value, dtype=np.float64)
         expected = (structure.prediction_horizon, structure.cv_count)
-        if array.shape != expected or not np.isfinite(array).all():
+        if array.shape != expected or not sound(array).all():
             raise InputError(
-                path, f"shape {list(array.shape)}", f"finite numbers of shape {list(expected)} [CV unit]"
+                path,
+                f"shape {list(array.shape)}",
+                f"finite numbers of size {LARGEST:g} at most and of shape {list(expected)} [CV unit]",
             )
     low, high = np.asarray(tuning.mv_low), np.asarray(tuning.mv_high)
     for i, name in enumerate(structure.mv_names):

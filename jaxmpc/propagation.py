@@ -15,7 +15,13 @@ from jaxtyping import Bool, Int
 from jaxmpc.blocking import moves_per_block, oscillation_rows, window_rows
 from jaxmpc.structure import Structure
 
-UNBOUNDED = 10**6  # whole steps that stand for "no limit" in integer arithmetic
+NEAR = (3, 30)  # steps around the wanted moves in which the nearest are looked for first
+MOST = 2_000_000  # combinations of position and move that are looked at in one chain, a few seconds
+UNBOUNDED = 10**12  # whole steps that stand for "no limit" in integer arithmetic
+
+
+class UndecidedError(Exception):
+    """Whether whole moves satisfy the hard rows would take too long to find out."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +62,6 @@ def chains_of(structure: Structure, row_low: np.ndarray, row_high: np.ndarray) -
             row += len(pairs)
             ahead = slice(row, row + len(windows))
             columns = len(chains) * blocks + np.arange(blocks)
-            whole = lambda v: np.clip(np.round(v), -UNBOUNDED, UNBOUNDED).astype(int)  # noqa: E731
             chains.append(
                 Chain(
                     columns,
@@ -71,6 +76,11 @@ def chains_of(structure: Structure, row_low: np.ndarray, row_high: np.ndarray) -
             )
         row += len(windows)
     return chains
+
+
+def whole(steps: np.ndarray) -> Int[np.ndarray, "..."]:
+    """Whole steps, with `UNBOUNDED` for anything larger and for no limit."""
+    return np.clip(np.round(steps), -UNBOUNDED, UNBOUNDED).astype(int)
 
 
 def propagate(
@@ -162,6 +172,9 @@ def nearest(
 
     Window rows are not looked at. Dynamic programming over (position, last move), exact; costs milliseconds and is
     called only when rounding breaks a hard row.
+
+    Raises:
+        UndecidedError: where there are more moves and positions than can be looked at.
     """
     result = np.zeros(len(wanted), dtype=int)
     for chain in chains:
@@ -173,6 +186,22 @@ def nearest(
 
 
 def _nearest_in_chain(chain: Chain, wanted, lower, upper) -> list[int] | None:
+    """Of one MV: among the moves around the wanted ones first, which are few."""
+    around = whole(wanted)
+    for reach in NEAR:
+        low, high = np.maximum(lower, around - reach), np.minimum(upper, around + reach)
+        if (low == lower).all() and (high == upper).all():
+            break
+        path = _among(chain, wanted, low, high)
+        # paths that leave these limits have a move that alone is farther away
+        if path is not None and np.abs(path - wanted).sum() <= reach:
+            return path
+    return _among(chain, wanted, lower, upper)
+
+
+def _among(chain: Chain, wanted, lower, upper) -> list[int] | None:
+    """Of one MV, by dynamic programming over all moves within these limits."""
+    looked_at = 0
     layers: list[dict] = [{(0, None): (0.0, None, None)}]
     for b in range(len(wanted)):
         layer: dict = {}
@@ -185,6 +214,9 @@ def _nearest_in_chain(chain: Chain, wanted, lower, upper) -> list[int] | None:
             count = int(chain.counts[b])
             first = max(first, -((position - int(chain.low[b])) // count))
             final = min(final, (int(chain.high[b]) - position) // count)
+            looked_at += 1 + max(final - first + 1, 0)
+            if looked_at > MOST:
+                raise UndecidedError
             for move in range(first, final + 1):
                 key = (position + count * move, move if remember else None)
                 total = cost + abs(move - wanted[b])

@@ -18,7 +18,7 @@ from jaxmpc.constants import Constants
 from jaxmpc.gap import FINEST, closes, cutoff, reference
 from jaxmpc.levelset import LowerModel
 from jaxmpc.newton import WarmStart
-from jaxmpc.propagation import Chain, chains_of, nearest, satisfied
+from jaxmpc.propagation import Chain, chains_of, nearest, satisfied, whole
 from jaxmpc.relaxer import Relaxations
 from jaxmpc.status import FAILED, INFEASIBLE, LIMIT, OPTIMAL
 
@@ -173,8 +173,8 @@ class Search:
 
     # ---- incumbents
     def rounded(self, moves: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray | None:
-        """Whole moves near `moves` that satisfy the hard rows, or None where there are none."""
-        point = np.clip(np.round(moves).astype(int), lower, upper)
+        """Whole moves near `moves` that satisfy the hard rows, or None where there are none; see `nearest`."""
+        point = np.clip(whole(moves), lower, upper)
         if satisfied(self.chains, point[None], lower, upper)[0]:
             return point
         point = nearest(self.chains, moves, lower, upper)

@@ -154,7 +154,7 @@ class SteadyMap:
         """Read a map written by `save`. Raises `InputError` naming the field that is wrong."""
         try:
             body = json.loads(Path(path).read_text())
-        except (OSError, json.JSONDecodeError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise InputError("map file", str(path), f"a readable JSON file ({error})") from error
         if not isinstance(body, dict):
             raise InputError("map file", str(path), "a JSON object with choke, lift, cv and values")

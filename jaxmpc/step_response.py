@@ -9,6 +9,7 @@ does it, so that a sample costs O(N) and not O(N^2).
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,10 @@ from jaxtyping import Array, Float
 from jaxmpc import html
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
-from jaxmpc.structure import Structure
+from jaxmpc.structure import LARGEST, Structure, sound
 
 FORMAT = "jaxmpc/step-response/1"
+HALF_CHARACTER = re.compile("[\ud800-\udfff]")  # JSON can escape one, UTF-8 cannot encode it
 
 
 class StepResponseModel(eqx.Module):
@@ -84,7 +86,7 @@ class StepResponseModel(eqx.Module):
         """Read a model written by `save`. Raises `InputError` naming the field that is wrong."""
         try:
             body = json.loads(Path(path).read_text())
-        except (OSError, json.JSONDecodeError) as error:
+        except (OSError, ValueError, RecursionError) as error:  # no file, no text, no JSON
             raise InputError("model file", str(path), f"a readable JSON file ({error})") from error
         return cls.from_dict(body)
 
@@ -140,6 +142,8 @@ def make_model(
     for key, names in (("cv", cv_names), ("mv", mv_names)):
         if not names or len(set(names)) != len(names) or not all(isinstance(n, str) and n for n in names):
             raise InputError(f"{path}.{key}", list(names), "one or more distinct, non-empty names")
+        if any(HALF_CHARACTER.search(name) for name in names):
+            raise InputError(f"{path}.{key}", list(names), "names of whole characters, which a file can hold")
     if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not np.isfinite(dt) or dt <= 0:
         raise InputError(f"{path}.dt", dt, "a positive sampling interval [s]")
     try:
@@ -149,9 +153,10 @@ def make_model(
     expected = f"[cv][mv][n] = [{len(cv_names)}][{len(mv_names)}][N >= 1] numbers of equal length N"
     if array.ndim != 3 or array.shape[:2] != (len(cv_names), len(mv_names)) or array.shape[2] < 1:
         raise InputError(f"{path}.coefficients", f"shape {list(array.shape)}", expected)
-    if not np.isfinite(array).all():
-        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise InputError(f"{path}.coefficients{list(where)}", array[where], "a finite number")
+    if not sound(array).all():
+        where = tuple(int(i) for i in np.argwhere(~sound(array))[0])
+        expected = f"a finite number of size {LARGEST:g} at most [CV unit per MV unit]"
+        raise InputError(f"{path}.coefficients{list(where)}", float(array[where]), expected)
     for key, units, names in (("cv_units", cv_units, cv_names), ("mv_units", mv_units, mv_names)):
         if units and len(units) != len(names):
             raise InputError(f"{path}.{key}", list(units), f"{len(names)} units, one per name")

@@ -19,8 +19,9 @@ from jaxmpc.condense import DRIFT, CondensedQp, QpInstance, condensed, integer_c
 from jaxmpc.constants import Constants
 from jaxmpc.errors import InputError
 from jaxmpc.integer import solve_integers
+from jaxmpc.memory import check_ranges, check_size
 from jaxmpc.newton import WarmStart
-from jaxmpc.propagation import chains_of, nearest
+from jaxmpc.propagation import chains_of, nearest, whole
 from jaxmpc.relaxer import Relaxations, Relaxer
 from jaxmpc.search import SearchResult
 from jaxmpc.step_response import StepResponseModel
@@ -42,6 +43,7 @@ class StepSolver:
     """
 
     def __init__(self, structure: Structure, tunings: Sequence[Tuning], models: Sequence[StepResponseModel]):
+        check_size(structure)
         self.structure = structure
         count = max(len(tunings), len(models))
         one_each = lambda given: list(given) * count if len(given) == 1 else list(given)  # noqa: E731
@@ -149,6 +151,7 @@ class StepSolver:
         """Constants with an envelope as wide as the integer ranges, and the problems for them, their limits finite."""
         integer = relaxer.integer
         lower, upper = self._bounded(instances)
+        check_ranges(self.structure, lower[:, integer], upper[:, integer])
         envelope = int(max(np.abs(lower[:, integer]).max(), np.abs(upper[:, integer]).max()))
         if envelope > 1:
             relaxer = self.relaxer(envelope if envelope <= WIDEST_ENVELOPE else 0)
@@ -191,7 +194,7 @@ def _whole_near(structure: Structure, instances: QpInstance, i: int, wanted: np.
     row_low, row_high = np.asarray(instances.row_low)[i], np.asarray(instances.row_high)[i]
     chains = chains_of(structure, row_low, row_high)
     for reach in (0, 3, 30):
-        low, high = np.floor(wanted + 0.5).astype(int) - reach, np.floor(wanted + 0.5).astype(int) + reach
+        low, high = whole(np.floor(wanted + 0.5)) - reach, whole(np.floor(wanted + 0.5)) + reach
         found = nearest(chains, wanted, low, high)
         if found is not None:
             return found

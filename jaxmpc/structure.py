@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxmpc.errors import InputError
 
+LARGEST = 1e30  # size of a number from which on it cannot be meant, and products of squares overflow
 THESIS_BLOCKS = (1, 1, 1, 1, 2, 2, 4, 4, 8, 8, 8, 16, 16, 32, 32, 64)  # (6.3)
 
 
@@ -86,10 +87,13 @@ class Structure:
             if step is not None and (
                 isinstance(step, bool)
                 or not isinstance(step, (int, float))
-                or not math.isfinite(step)
-                or step <= 0
+                or not 1 / LARGEST <= step <= LARGEST
             ):
-                raise InputError(f"structure.integer_step.{name}", step, "a positive step [MV unit]")
+                raise InputError(
+                    f"structure.integer_step.{name}",
+                    step,
+                    f"a positive step, {1 / LARGEST:g} to {LARGEST:g} [MV unit]",
+                )
         object.__setattr__(
             self, "integer_step", tuple(None if step is None else float(step) for step in steps)
         )
@@ -127,8 +131,15 @@ class Structure:
 def check_vector(path: str, value, names: tuple[str, ...], unit: str) -> np.ndarray:
     """A finite vector with one entry per name, or an `InputError`."""
     array = np.asarray(value, dtype=np.float64)
-    if array.shape != (len(names),) or not np.isfinite(array).all():
+    if array.shape != (len(names),) or not sound(array).all():
         raise InputError(
-            path, np.asarray(value).tolist(), f"{len(names)} finite numbers [{unit}] for {', '.join(names)}"
+            path,
+            np.asarray(value).tolist(),
+            f"{len(names)} finite numbers of size {LARGEST:g} at most [{unit}] for {', '.join(names)}",
         )
     return array
+
+
+def sound(values: np.ndarray) -> np.ndarray:
+    """Which numbers are finite and not beyond `LARGEST`."""
+    return np.abs(values) <= LARGEST

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxmpc import html
 from jaxmpc.errors import InputError
-from jaxmpc.structure import Structure
+from jaxmpc.structure import LARGEST, Structure
 
 
 class Tuning(eqx.Module):
@@ -214,6 +214,10 @@ def _vector(path: str, given, names: tuple[str, ...], key: str) -> np.ndarray:
             )
         if key in LEAST and value < LEAST[key]:
             raise InputError(f"{path}[{i}]", value, f"{LEAST[key]:g} or more [{UNITS[key]}] for {names[i]}")
+        if LARGEST < abs(value) < np.inf:
+            more = ", or none for no limit" if key in LIMITS else ""
+            expected = f"a number of size {LARGEST:g} at most{more} [{UNITS[key]}] for {names[i]}"
+            raise InputError(f"{path}[{i}]", value, expected)
         out[i] = value
     return out
 

@@ -331,7 +331,7 @@ def load_parameters(path: str | Path) -> WellParameters:
     """Read parameters written by `save_parameters`. Raises `InputError` naming the field that is wrong."""
     try:
         body = json.loads(Path(path).read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError("parameter file", str(path), f"a readable JSON file ({error})") from error
     return parameters_from_dict(body.get("parameters", body) if isinstance(body, dict) else body)
 

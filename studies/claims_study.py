@@ -140,7 +140,7 @@ class _Clock:
 def _read(file: Path) -> dict[str, list[float]]:
     try:
         return json.loads(file.read_text())
-    except (OSError, json.JSONDecodeError):
+    except (OSError, ValueError, RecursionError):
         return {}
 
 

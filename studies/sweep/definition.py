@@ -206,7 +206,7 @@ def load_definition(name_or_path: str | Path) -> StudyDefinition:
     except OSError as error:
         expected = f"a definition file, or one of {', '.join(shipped)} ({error.strerror or error})"
         raise InputError("study", str(name_or_path), expected, near(name_or_path, shipped)) from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError("study", str(path), f"a TOML file ({error})") from None
     return StudyDefinition.from_dict(body, path.parent)
 
