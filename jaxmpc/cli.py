@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxmpc.errors import InputError, MissingToolError
-from jaxmpc.files import check_target, write_atomically
+from jaxmpc.files import check_folder, check_target, write_atomically
 from jaxmpc.options import COMPARISONS, parser
 
 EXIT_OPTIMAL, EXIT_OTHER, EXIT_BAD_INPUT, EXIT_INFEASIBLE, EXIT_LIMIT = 0, 1, 2, 3, 4
@@ -65,13 +65,13 @@ def _complain(error: object, status: int) -> int:
 def _fail(error: OSError) -> int:
     """What the system refused, in one line."""
     name = error.filename
-    if (
-        name is None
-    ):  # writing to a stream that is open: what is left of it is dropped, or it would fail once more
+    if name is None:
         with contextlib.suppress(OSError, ValueError):
             sys.stdout.flush()
             return _complain(error.strerror or error, EXIT_OTHER)
-        name = "standard output"
+        name = (
+            "standard output"  # what is left in it is dropped: the interpreter would try again and complain
+        )
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
     return _complain(f"{os.fsdecode(name)}: {error.strerror or error}", EXIT_OTHER)
 
@@ -194,7 +194,7 @@ def _study_run(options: argparse.Namespace) -> int:
 
 
 def _study_comparison(options: argparse.Namespace, plant) -> int:
-    check_target("--out", options.out / "results")
+    check_folder("--out", options.out)
     asked = options.out, options.quick, plant
     if options.study == "claims":
         from studies.claims_study import run_claims
@@ -309,7 +309,7 @@ def _simulate(options: argparse.Namespace) -> int:
         raise InputError(
             "scenario", options.scenario, "a store and a number, such as results/deadzone.zarr#12"
         )
-    check_target("--out", options.out / "run")
+    check_folder("--out", options.out)
     import warnings
 
     from studies.sweep.rerun import rerun
@@ -336,7 +336,7 @@ def _figures(options: argparse.Namespace) -> int:
         for id, entry in FIGURES.items():
             print(f"{id:>8}  {entry.title}  ({entry.study or 'no study'})")
         return EXIT_OPTIMAL
-    check_target("--out", options.out / "figure")
+    check_folder("--out", options.out)
     from figures.gallery import write_gallery
     from figures.produce import produce
 
@@ -359,7 +359,7 @@ def _bench(options: argparse.Namespace) -> int:
     if out is not None:
         check_target("--json", out)
     if folder is not None:
-        check_target("--figures", folder / "figure")
+        check_folder("--figures", folder)
     from studies.bench.run import run_bench, table, wrong
 
     report = run_bench(quick=options.quick, only=only, json_path=out)

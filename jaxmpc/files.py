@@ -75,6 +75,15 @@ def check_target(field: str, path: str | Path, inputs: Iterable[str | Path] = ()
         raise InputError(field, str(path), f"a file that can be written ({reason})") from None
 
 
+def check_folder(field: str, path: str | Path) -> None:
+    """Refuse a folder in which no file could be written later; nothing is made; arguments and errors of `check_target`."""
+    try:
+        _probe(Path(os.path.realpath(path)) / "file")
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(field, str(path), f"a folder that can be written ({reason})") from None
+
+
 def cache_folder(kind: str) -> Path:
     """Where the cache of this kind is: in ``$JAXMPC_CACHE`` or ``~/.cache/jaxmpc``.
 
@@ -88,10 +97,7 @@ def cache_folder(kind: str) -> Path:
         if os.access(_existing(home), os.W_OK | os.X_OK):
             return home / kind
         problem = f"{home} cannot be written"
-    except (
-        RuntimeError,
-        OSError,
-    ) as error:  # no $HOME and no entry in the password database, or no such folder
+    except (RuntimeError, OSError) as error:  # no $HOME and no entry in the password database
         problem = str(error)
     folder = _private_folder()
     if folder not in _SAID:

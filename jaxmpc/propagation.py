@@ -16,7 +16,8 @@ from jaxmpc.blocking import moves_per_block, oscillation_rows, window_rows
 from jaxmpc.structure import Structure
 
 NEAR = (3, 30)  # steps around the wanted moves in which the nearest are looked for first
-MOST = 2_000_000  # combinations of position and move that are looked at in one chain, a few seconds
+MOST = 20_000_000  # combinations of position and move that are looked at in one chain
+HELD = 2_000_000  # of them that are remembered
 UNBOUNDED = 10**12  # whole steps that stand for "no limit" in integer arithmetic
 
 
@@ -201,7 +202,7 @@ def _nearest_in_chain(chain: Chain, wanted, lower, upper) -> list[int] | None:
 
 def _among(chain: Chain, wanted, lower, upper) -> list[int] | None:
     """Of one MV, by dynamic programming over all moves within these limits."""
-    looked_at = 0
+    looked_at = kept = 0
     layers: list[dict] = [{(0, None): (0.0, None, None)}]
     for b in range(len(wanted)):
         layer: dict = {}
@@ -214,8 +215,8 @@ def _among(chain: Chain, wanted, lower, upper) -> list[int] | None:
             count = int(chain.counts[b])
             first = max(first, -((position - int(chain.low[b])) // count))
             final = min(final, (int(chain.high[b]) - position) // count)
-            looked_at += 1 + max(final - first + 1, 0)
-            if looked_at > MOST:
+            looked_at += max(final - first + 1, 0)
+            if looked_at > MOST or kept + len(layer) + final - first >= HELD:
                 raise UndecidedError
             for move in range(first, final + 1):
                 key = (position + count * move, move if remember else None)
@@ -225,6 +226,7 @@ def _among(chain: Chain, wanted, lower, upper) -> list[int] | None:
         if not layer:
             return None
         layers.append(layer)
+        kept += len(layer)
     key = min(layers[-1], key=lambda k: layers[-1][k][0])
     path = []
     for layer in layers[:0:-1]:

@@ -6,6 +6,7 @@ engineering units.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 from collections.abc import Callable, Sequence
@@ -21,7 +22,7 @@ from jaxmpc.errors import InputError
 from jaxmpc.integer import solve_integers
 from jaxmpc.memory import check_ranges, check_size
 from jaxmpc.newton import WarmStart
-from jaxmpc.propagation import chains_of, nearest, whole
+from jaxmpc.propagation import UndecidedError, chains_of, nearest, whole
 from jaxmpc.relaxer import Relaxations, Relaxer
 from jaxmpc.search import SearchResult
 from jaxmpc.step_response import StepResponseModel
@@ -195,9 +196,10 @@ def _whole_near(structure: Structure, instances: QpInstance, i: int, wanted: np.
     chains = chains_of(structure, row_low, row_high)
     for reach in (0, 3, 30):
         low, high = whole(np.floor(wanted + 0.5)) - reach, whole(np.floor(wanted + 0.5)) + reach
-        found = nearest(chains, wanted, low, high)
-        if found is not None:
-            return found
+        with contextlib.suppress(UndecidedError):
+            found = nearest(chains, wanted, low, high)
+            if found is not None:
+                return found
     return np.round(wanted)
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from jaxmpc.errors import InputError
-from jaxmpc.files import cache_folder, check_target, write_atomically
+from jaxmpc.files import cache_folder, check_folder, check_target, write_atomically
 
 posix = pytest.mark.skipif(os.name != "posix", reason="modes, links and pipes of POSIX")
 pytestmark = posix
@@ -254,6 +254,17 @@ def test_a_name_that_no_file_can_have_is_refused_and_no_folder_is_made(tmp_path,
     with pytest.raises(InputError, match="a file that can be written"):
         check_target("--out", tmp_path / name)
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("name", ["file", "file/x", "n" * 300, f"new/{'n' * 300}", "null\0character", "loop"])
+def test_a_folder_that_cannot_be_written_is_refused_and_none_is_made(tmp_path, name):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(InputError, match="a folder that can be written"):
+        check_folder("--out", tmp_path / name)
+    for good in (tmp_path, tmp_path / "new" / "folder"):
+        check_folder("--out", good)
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["file", "loop"]
 
 
 def test_what_is_checked_stays_as_it_is(tmp_path):
