@@ -2,11 +2,13 @@
 
 import dataclasses
 import errno
+import os
 import shutil
 import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 import warnings
 from pathlib import Path
@@ -697,6 +699,30 @@ def test_an_export_that_fails_leaves_the_file_as_it_was(tmp_path, reference, mon
         export(tmp_path / "reference.zarr", target, overwrite=True)
     assert target.read_text() == "precious"
     assert not list(tmp_path.glob(".table*"))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes of POSIX")
+@pytest.mark.parametrize("kind", ["csv", "netcdf"])
+def test_an_export_goes_into_a_pipe_as_into_a_file(tmp_path, reference, kind):
+    path, pipe = tmp_path / "reference.zarr", tmp_path / "pipe"
+    os.mkfifo(pipe)
+    got = []
+    reader = threading.Thread(target=lambda: got.append(pipe.read_bytes()), daemon=True)
+    reader.start()
+    export(path, pipe, kind)
+    reader.join(timeout=60)
+    assert got == [export(path, tmp_path / "file", kind).read_bytes()]
+    assert pipe.is_fifo()
+
+
+def test_an_export_does_not_replace_a_part_of_the_store(tmp_path, reference):
+    path = tmp_path / "reference.zarr"
+    before = (path / "zarr.json").read_bytes()
+    for target in (path, path / "zarr.json", path / "new.csv"):
+        with pytest.raises(InputError, match="target"):
+            export(path, target, "csv", overwrite=True)
+    assert (path / "zarr.json").read_bytes() == before
+    assert not (path / "new.csv").exists()
 
 
 def test_parquet_without_its_library_says_how_to_get_it(tmp_path, reference, monkeypatch):
