@@ -20,7 +20,7 @@ from jaxmpc.errors import InputError
 from jaxmpc.structure import Structure
 from jaxmpc.tuning import Tuning
 
-LARGEST = 1e12  # CV unit; from here on double precision leaves too few digits for what the moves do
+IMPLAUSIBLE = 1e12  # CV unit; from here on double precision leaves too few digits for what the moves do
 
 QUALITY = ("good", "missing", "outside", "frozen")  # of a measurement, by its code
 GOOD, MISSING, OUTSIDE, FROZEN = range(len(QUALITY))
@@ -55,7 +55,7 @@ class Sensors(eqx.Module):
     def judged(self, tuning: Tuning, cv: Float[Array, " cv"]) -> Sensors:
         """After another measurement [CV unit], which may be anything."""
         repeated = jnp.where(cv == self.value, self.repeated + 1, 0)
-        known = jnp.abs(cv) < LARGEST  # false for what is not a number
+        known = jnp.abs(cv) < IMPLAUSIBLE  # false for what is not a number
         inside = (cv >= tuning.measurement_low) & (cv <= tuning.measurement_high)
         moving = repeated < tuning.frozen_limit
         quality = jnp.where(known, jnp.where(inside, jnp.where(moving, GOOD, FROZEN), OUTSIDE), MISSING)
