@@ -1,8 +1,8 @@
-"""The well as an FMU: building it, and running it as a plant (thesis 3.2). The only importer of FMPy.
+"""The well as an FMU: building it, and running it as a plant (thesis 3.2).
 
 `build_fmu` compiles the generated sources once and keeps the result in a cache that is keyed by content.
-`FmuPlant` steps an FMU with the inputs and outputs of the JAX plant. FMPy would interpolate continuous inputs
-between samples; the plant sets them and steps explicitly, which holds them.
+`FmuPlant` steps an FMU, in a process of its own, with the inputs and outputs of the JAX plant. FMPy would
+interpolate continuous inputs between samples; the plant sets them and steps explicitly, which holds them.
 """
 
 from __future__ import annotations
@@ -16,16 +16,15 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import weakref
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from identify.fmu_process import TIME_LIMIT, FmuProcess
 from identify.fmu_source import MODEL_IDENTIFIER, fmu_files
-from jaxmpc import files
 from jaxmpc.actuator import check_actuator, move_choke
+from jaxmpc.cache import cache_folder, read_sealed, sealed
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.files import write_atomically
 from jaxmpc.plant import STATE_SCALE, WellOutputs, check_inputs
@@ -33,19 +32,21 @@ from jaxmpc.well import DEFAULT_CHOKE, DEFAULT_LIFT, INPUTS, OUTPUTS, STATES, We
 
 # No fused multiply-adds: the FMU and the JAX plant then round alike.
 COMPILER_FLAGS = "-O2 -ffp-contract=off -fno-math-errno"
+CACHE_FORMAT = 2  # of the files in the cache: sealed
 STEADY_DRIFT = 1e-12  # scaled drift [1/s] below which `init` stops settling
 STEADY_SAMPLES = 17280  # 48 h
-
-
-def cache_folder() -> Path:
-    """Where built FMUs are kept, see `jaxmpc.files.cache_folder`."""
-    return files.cache_folder("fmu")
+INPUT_NAMES = tuple(row[0] for row in INPUTS)
+OUTPUT_NAMES = tuple(row[0] for row in OUTPUTS)
+STATE_NAMES = tuple(f"state.{row[0]}" for row in STATES)
+SWITCH = "SepticControl"
 
 
 def build_fmu(
     fmi: int = 2, out: str | Path | None = None, parameters: WellParameters | None = None, force: bool = False
 ) -> Path:
     """Build the well as an FMI co-simulation FMU for this machine; a second call builds nothing.
+
+    A damaged FMU in the cache is built anew, and standard error says so.
 
     Args:
         fmi: 2 or 3, the FMI version.
@@ -66,11 +67,14 @@ def build_fmu(
         raise InputError("out", str(out), "the path of a file that ends in .fmu")
     parameters = check_parameters(WellParameters() if parameters is None else parameters)
     contents, token = fmu_files(fmi, parameters)
-    machine = hashlib.sha256(repr((token, sys.platform, platform.machine(), COMPILER_FLAGS)).encode())
-    cached = cache_folder() / f"{MODEL_IDENTIFIER}-fmi{fmi}-{machine.hexdigest()[:16]}.fmu"
-    if force or not cached.exists():
-        write_atomically(cached, _compiled(contents))
-    return cached if out is None else write_atomically(out, cached.read_bytes())
+    key = (CACHE_FORMAT, token, sys.platform, platform.machine(), COMPILER_FLAGS)
+    name = f"{MODEL_IDENTIFIER}-fmi{fmi}-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.fmu"
+    cached = cache_folder("fmu") / name
+    content = None if force else read_sealed(cached)
+    if content is None:
+        content = sealed(_compiled(contents))
+        write_atomically(cached, content)
+    return cached if out is None else write_atomically(out, content)
 
 
 def _compiler() -> str | None:
@@ -132,7 +136,7 @@ def _compiled(contents: dict[str, str]) -> bytes:
             f"build({str(tree)!r}, {str(build)!r}, cmake_options={_cmake_options()!r})"
         )
         done = subprocess.run(
-            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
+            [sys.executable, "-P", "-c", code], env=environment, capture_output=True, text=True, check=False
         )
         if done.returncode != 0:
             raise MissingToolError(
@@ -155,15 +159,16 @@ def validate_fmu(path: str | Path) -> list[str]:
 
 
 class FmuPlant:
-    """An FMU of the well, stepped like `jaxmpc.plant.WellPlant`, with its state inside.
+    """An FMU of the well, stepped like `jaxmpc.plant.WellPlant`, with its state in a process of its own.
 
-    Use it as a context manager, or `close` it; that unloads the library and removes the unpacked files. One
+    Use it as a context manager, or `close` it; that ends the process and removes the unpacked files. One
     instance serves any number of runs: `init` resets it.
 
     Args:
         path: of the FMU; by default the shipped well, built on first use (FMI 2.0).
         actuator: ``continuous`` or ``step``, see `jaxmpc.actuator`.
         dt: sampling interval [s].
+        time_limit: for one call of the FMU [s].
 
     Attributes:
         token: instantiation token of the FMU, a digest of its contents.
@@ -171,69 +176,51 @@ class FmuPlant:
         settled: whether the last `init` found a steady state within 48 hours.
 
     Raises:
-        InputError: for a file that is not an FMU of the well.
+        InputError: for a file that is not an FMU of the well, with the reason.
         MissingToolError: if it has to be built and cannot.
+        PlantError: if the FMU crashes, hangs or reports an error; so do `init`, `step`, `measure` and `x`.
     """
 
-    def __init__(self, path: str | Path | None = None, actuator: str = "continuous", dt: float = 10.0):
+    def __init__(
+        self,
+        path: str | Path | None = None,
+        actuator: str = "continuous",
+        dt: float = 10.0,
+        time_limit: float = TIME_LIMIT,
+    ):
         self.actuator = check_actuator(actuator, "plant.actuator")
         if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not 0 < dt < np.inf:
             raise InputError("plant.dt", dt, "a positive number of seconds")
         self.dt = float(dt)
         self.path = Path(path) if path is not None else build_fmu()
-        if not self.path.is_file():
-            raise InputError("plant.path", str(self.path), "an existing .fmu file")
-        self._folder = tempfile.mkdtemp(prefix="jaxmpc-fmu-")
-        self._finalizer = weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
+        self._fmu = FmuProcess(self.path, time_limit)
+        self.token, self.fmi = self._fmu.token, self._fmu.fmi
         try:
-            self._load()
-        except Exception:
-            self._finalizer()
+            self._check_variables()
+            self.init()
+        except BaseException:
+            self._fmu.close()
             raise
-        self.init()
 
-    def _load(self) -> None:
-        import fmpy
-        from fmpy.fmi2 import FMU2Slave
-        from fmpy.fmi3 import FMU3Slave
-
-        try:
-            description = fmpy.read_model_description(str(self.path))
-            fmpy.extract(str(self.path), self._folder)
-        except Exception as error:
-            raise InputError("plant.path", str(self.path), f"a readable FMU ({error})") from error
-        references = {v.name: v.valueReference for v in description.modelVariables}
-        names = {
-            "input": [row[0] for row in INPUTS],
-            "output": [row[0] for row in OUTPUTS],
-            "state": [f"state.{row[0]}" for row in STATES],
-        }
-        wanted = [*names["input"], *names["output"], *names["state"], "SepticControl"]
-        missing = [name for name in wanted if name not in references]
-        if missing or not description.coSimulation:
-            raise InputError(
-                "plant.path", str(self.path), f"a co-simulation FMU of the well with the variables {missing}"
-            )
-        self._references = {kind: [references[n] for n in group] for kind, group in names.items()}
-        self._switch = [references["SepticControl"]]
-        self.token = description.guid
-        self.fmi = 3 if str(description.fmiVersion).startswith("3") else 2
-        slave = FMU3Slave if self.fmi == 3 else FMU2Slave
-        self._fmu: Any = slave(
-            guid=description.guid,
-            unzipDirectory=self._folder,
-            modelIdentifier=description.coSimulation.modelIdentifier,
-            instanceName="well",
+    def _check_variables(self) -> None:
+        """Refuse an FMU of something else."""
+        wanted = dict.fromkeys(
+            (*INPUT_NAMES, *OUTPUT_NAMES, *STATE_NAMES), "Float64" if self.fmi == 3 else "Real"
         )
-        self._fmu.instantiate()
-
-    def _get(self, kind: str) -> list[float]:
-        read = self._fmu.getFloat64 if self.fmi == 3 else self._fmu.getReal
-        return read(self._references[kind])
-
-    def _set(self, kind: str, values) -> None:
-        write = self._fmu.setFloat64 if self.fmi == 3 else self._fmu.setReal
-        write(self._references[kind], [float(v) for v in values])
+        wanted[SWITCH] = "Boolean"
+        found = self._fmu.variables
+        missing = [name for name in wanted if name not in found]
+        if missing:
+            raise InputError(
+                "plant.path", str(self.path), f"an FMU of the well (without {', '.join(missing)} it is not)"
+            )
+        for name, kind in wanted.items():
+            if found[name][0] != kind:
+                raise InputError(
+                    "plant.path",
+                    str(self.path),
+                    f"an FMU of the well ({name} is {found[name][0]}, not {kind})",
+                )
 
     def init(
         self, choke: float = DEFAULT_CHOKE, lift: float = DEFAULT_LIFT, disturbance: float = 0.0, x=None
@@ -252,51 +239,36 @@ class FmuPlant:
         Raises:
             InputError: for inputs outside their range, or states of the wrong shape or not finite.
         """
-        self._open()
         check_inputs(choke, lift, disturbance)
         if x is not None and (np.shape(x) != (len(STATES),) or not np.isfinite(x).all()):
             raise InputError("x", x, f"{len(STATES)} finite states")
-        self._start(choke, lift, disturbance, x)
+        inputs = _floats(INPUT_NAMES, (choke, lift, disturbance))
+        self._start(inputs, x)
         self.settled = True
         if x is None and (choke, lift, disturbance) != (DEFAULT_CHOKE, DEFAULT_LIFT, 0.0):
             settled = self._settle()
             # Start again, so that time is zero.
-            self._start(choke, lift, disturbance, settled)
+            self._start(inputs, settled)
         self._position, self._lift = float(choke), float(lift)
         return self.measure()
 
     reset = init
 
-    def _start(self, choke, lift, disturbance, x) -> None:
-        self._time = 0.0
-        self._fmu.reset()
-        if x is not None:
-            self._set("state", x)
-        if self.fmi == 3:
-            self._fmu.enterInitializationMode(startTime=0.0)
-        else:
-            self._fmu.setupExperiment(startTime=0.0)
-            self._fmu.enterInitializationMode()
-        self._fmu.exitInitializationMode()
-        # The switch returns to false with every reset.
-        self._fmu.setBoolean(self._switch, [True])
-        self._set("input", (choke, lift, disturbance))
+    def _start(self, inputs: dict[str, float], x) -> None:
+        self._fmu.start({} if x is None else _floats(STATE_NAMES, x))
+        # The switch returns to false with every start.
+        self._fmu.set({SWITCH: True, **inputs})
 
     def _settle(self) -> list[float]:
-        before = np.array(self._get("state"))
+        before = self._fmu.get(STATE_NAMES)
         for _ in range(STEADY_SAMPLES // 60):
-            for _ in range(60):
-                self._advance()
-            after = np.array(self._get("state"))
-            self.settled = bool(np.max(np.abs(after - before) / STATE_SCALE) < STEADY_DRIFT * 60 * self.dt)
+            after = self._fmu.step(self.dt, outputs=STATE_NAMES, count=60)
+            drift = np.max(np.abs(np.subtract(after, before)) / STATE_SCALE)
+            self.settled = bool(drift < STEADY_DRIFT * 60 * self.dt)
             before = after
             if self.settled:
                 break
-        return before.tolist()
-
-    def _advance(self) -> None:
-        self._fmu.doStep(self._time, self.dt)
-        self._time += self.dt
+        return before
 
     def step(self, mv, disturbance: float = 0.0) -> WellOutputs:
         """One sample: move the actuators, hold the inputs for `dt`, and measure at the end.
@@ -308,7 +280,6 @@ class FmuPlant:
         Raises:
             InputError: for anything but two finite numbers and a finite disturbance; nothing has moved then.
         """
-        self._open()
         demand = np.asarray(mv, dtype=np.float64)
         if demand.shape != (2,) or not np.isfinite(demand).all():
             raise InputError("mv", mv, "choke [%] and lift [m3/h], two finite numbers")
@@ -316,37 +287,31 @@ class FmuPlant:
             raise InputError("reservoir_pressure_offset", disturbance, "a finite pressure change [bar]")
         self._position = float(move_choke(self.actuator, self._position, demand[0]))
         self._lift = max(float(demand[1]), 0.0)
-        self._set("input", (self._position, self._lift, disturbance))
-        self._advance()
-        return self.measure()
+        inputs = _floats(INPUT_NAMES, (self._position, self._lift, disturbance))
+        return self._measured(self._fmu.step(self.dt, inputs, OUTPUT_NAMES))
 
     def measure(self) -> WellOutputs:
         """What the FMU measures now."""
-        self._open()
-        y = self._get("output")
+        return self._measured(self._fmu.get(OUTPUT_NAMES))
+
+    def _measured(self, y: list[float]) -> WellOutputs:
         return WellOutputs(np.array(y[:2]), np.array([self._position, self._lift]), *y[2:])
 
     @property
     def x(self) -> np.ndarray:
         """``"8"``, the states in the order and units of `jaxmpc.well.STATES`."""
-        self._open()
-        return np.array(self._get("state"))
-
-    def _open(self) -> None:
-        if not self._finalizer.alive:
-            raise InputError("plant", "closed", "an FMU plant that has not been closed")
+        return np.array(self._fmu.get(STATE_NAMES))
 
     def close(self) -> None:
-        """Free the FMU, unload its library, and remove the unpacked files; twice is once."""
-        if not self._finalizer.alive:
-            return
-        self._fmu.terminate()
-        self._fmu.freeInstance()
-        self._fmu.freeLibrary()
-        self._finalizer()
+        """Free the FMU, end its process, and remove the unpacked files; twice is once."""
+        self._fmu.close()
 
     def __enter__(self) -> FmuPlant:
         return self
 
     def __exit__(self, *_) -> None:
         self.close()
+
+
+def _floats(names: tuple[str, ...], values) -> dict[str, float]:
+    return {name: float(value) for name, value in zip(names, values, strict=True)}

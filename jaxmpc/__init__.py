@@ -7,20 +7,15 @@ to leave it off. The public names of its modules can be taken from the package i
 """
 
 import os as _os
-import sys as _sys
 from importlib import import_module as _import_module
 
 import jax as _jax
 
-from jaxmpc.files import cache_folder as _cache_folder
+from jaxmpc.cache import keep_programs as _keep_programs
 
 _jax.config.update("jax_enable_x64", True)
-if not _os.environ.get("JAX_COMPILATION_CACHE_DIR") and not _os.environ.get("JAXMPC_NO_JIT_CACHE"):
-    try:
-        _jax.config.update("jax_compilation_cache_dir", str(_cache_folder("jit")))
-        _jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
-    except OSError as _error:
-        print(f"jaxmpc: compiled programs are not kept ({_error})", file=_sys.stderr)
+if not _os.environ.get("JAXMPC_NO_JIT_CACHE"):
+    _keep_programs()
 
 _HOME_OF = {
     "ContinuousController": "controller",

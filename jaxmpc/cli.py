@@ -18,7 +18,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from jaxmpc.errors import InputError, MissingToolError
+from jaxmpc.errors import InputError, MissingToolError, PlantError
 from jaxmpc.files import check_folder, check_target, write_atomically
 from jaxmpc.options import COMPARISONS, parser
 
@@ -46,7 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
             sys.stdout.flush()  # what cannot be written fails here, and not when the interpreter ends
     except InputError as error:
         return _complain(error, EXIT_BAD_INPUT)
-    except MissingToolError as error:
+    except (MissingToolError, PlantError) as error:
         return _complain(error, EXIT_OTHER)
     except KeyboardInterrupt:
         print("jaxmpc: stopped", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Errors that say what to do: one type for bad input, one for a missing tool. Raised by every package."""
+"""Errors that say what to do: one type for bad input, one for a missing tool, one for a plant that fails."""
 
 from __future__ import annotations
 
@@ -26,3 +26,7 @@ class InputError(ValueError):
 
 class MissingToolError(RuntimeError):
     """A program outside Python (a compiler, cmake) is missing; the message says what to install."""
+
+
+class PlantError(RuntimeError):
+    """A plant has failed while it ran, for example an FMU that crashed; the message says which one, how and when."""

@@ -9,7 +9,6 @@ import errno
 import os
 import secrets
 import stat
-import sys
 import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -82,43 +81,6 @@ def check_folder(field: str, path: str | Path) -> None:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(field, str(path), f"a folder that can be written ({reason})") from None
-
-
-def cache_folder(kind: str) -> Path:
-    """Where the cache of this kind is: in ``$JAXMPC_CACHE`` or ``~/.cache/jaxmpc``.
-
-    Without a home directory that can be written, it is a private folder among the temporary files, which one line on
-    standard error says.
-    """
-    if given := os.environ.get("JAXMPC_CACHE"):
-        return Path(given) / kind
-    try:
-        home = Path.home() / ".cache" / "jaxmpc"
-        if os.access(_existing(home), os.W_OK | os.X_OK):
-            return home / kind
-        problem = f"{home} cannot be written"
-    except (RuntimeError, OSError) as error:  # no $HOME and no entry in the password database
-        problem = str(error)
-    folder = _private_folder()
-    if folder not in _SAID:
-        _SAID.add(folder)
-        print(f"jaxmpc: the cache is in {folder} ({problem}; JAXMPC_CACHE moves it)", file=sys.stderr)
-    return folder / kind
-
-
-_SAID: set[Path] = set()
-
-
-def _private_folder() -> Path:
-    """A folder for temporary files that nobody else may write; the same for every process of a user."""
-    folder = Path(tempfile.gettempdir()) / f"jaxmpc-{os.getuid() if hasattr(os, 'getuid') else 'cache'}"
-    with contextlib.suppress(FileExistsError):
-        folder.mkdir(mode=0o700)
-    found = folder.lstat()
-    mine = not hasattr(os, "getuid") or found.st_uid == os.getuid()
-    if stat.S_ISDIR(found.st_mode) and mine and not found.st_mode & 0o022:
-        return folder
-    return Path(tempfile.mkdtemp(prefix="jaxmpc-"))
 
 
 def _status(path: Path) -> os.stat_result | None:

@@ -127,7 +127,7 @@ class _Clock:
     def __call__(self, name: str) -> np.ndarray:
         with open_results(self.results) as data:
             key = str(data.sel(controller=name).content_hash.item())
-        known = _read(self.file)
+        known = _read(self.file, self.say)
         if key not in known:
             self.say(f"{self.definition.name}, {name}: timed on the host.")
             known[key] = step_times(
@@ -137,10 +137,14 @@ class _Clock:
         return np.array(known[key])
 
 
-def _read(file: Path) -> dict[str, list[float]]:
+def _read(file: Path, say: Callable[[str], None]) -> dict[str, list[float]]:
+    """Times that were measured before; none if the file is missing or damaged."""
     try:
-        return json.loads(file.read_text())
-    except (OSError, ValueError, RecursionError):
+        return msgspec.json.decode(file.read_bytes(), type=dict[str, list[float]])
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, RecursionError) as error:
+        say(f"{file} is damaged and is measured anew ({error}).")
         return {}
 
 

@@ -18,7 +18,7 @@ COMPOSITION_ROOT = "jaxmpc/cli.py"
 APPS = "studies/notebooks/"  # what a user opens and edits: puts studies and figures together
 DOORS = {
     "highspy": ("jaxmpc/highs.py",),
-    "fmpy": ("identify/fmu.py",),
+    "fmpy": ("identify/fmu.py", "identify/fmu_worker.py"),
     "matplotlib": ("figures/",),
     "dask": ("studies/",),
     "distributed": ("studies/",),

@@ -63,7 +63,7 @@ def cache(tmp_path_factory):
     """A cache of recordings of its own; compiled programs stay where they are."""
     folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(instances, "cache_folder", lambda: folder)
+        patch.setattr(instances, "cache_folder", lambda kind: folder)
         yield folder
 
 
@@ -191,13 +191,19 @@ def test_another_model_reference_length_or_mode_is_another_recording(model, refe
     assert len(paths) == 6
 
 
-def test_a_damaged_recording_is_made_again(model, reference, cache):
+def test_a_damaged_recording_is_made_again_and_named(model, reference, cache, capsys):
     recordings = Recordings(model, reference, 8)
     path = recordings.path("continuous", MODE)
-    path.write_bytes(b"half a file")
     made = recordings.kept("continuous", MODE)
     assert len(made.cv) == 8
-    np.testing.assert_array_equal(instances._load(path).cv, made.cv)
+    sound = path.read_bytes()
+    for content in (b"half a file", sound[:-100], sound.replace(b"PK", b"KP"), bytes(len(sound))):
+        path.write_bytes(content)
+        capsys.readouterr()
+        assert instances._load(path) is None
+        assert capsys.readouterr().err == f"jaxmpc: {path} is damaged; it is made anew\n"
+    again = Recordings(model, reference, 8).kept("continuous", MODE)
+    np.testing.assert_array_equal(instances._load(path).cv, again.cv)
 
 
 # ---------------------------------------------------------------------------------------------- rows and runs

@@ -4,15 +4,13 @@ import errno
 import os
 import socket
 import stat
-import subprocess
-import sys
 import threading
 from pathlib import Path
 
 import pytest
 
 from jaxmpc.errors import InputError
-from jaxmpc.files import cache_folder, check_folder, check_target, write_atomically
+from jaxmpc.files import check_folder, check_target, write_atomically
 
 posix = pytest.mark.skipif(os.name != "posix", reason="modes, links and pipes of POSIX")
 pytestmark = posix
@@ -275,51 +273,3 @@ def test_what_is_checked_stays_as_it_is(tmp_path):
     check_target("--out", tmp_path / "new" / "folder" / "x")
     assert path.stat() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["old"]
-
-
-# ------------------------------------------------------------------------------------------------------- the cache
-
-
-def test_the_cache_is_where_the_environment_or_the_home_directory_says(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("JAXMPC_CACHE", str(tmp_path / "given"))
-    assert cache_folder("fmu") == tmp_path / "given" / "fmu"
-    monkeypatch.delenv("JAXMPC_CACHE")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert cache_folder("jit") == tmp_path / ".cache" / "jaxmpc" / "jit"
-    assert capsys.readouterr().err == ""
-
-
-def in_a_new_process(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run Python code as a user without a home directory."""
-    without = {k: v for k, v in os.environ.items() if k not in ("HOME", "JAXMPC_CACHE")}
-    nobody = "import os, pwd\ndef none(*_): raise KeyError('no entry')\npwd.getpwuid = none\n"
-    return subprocess.run(
-        [sys.executable, "-c", nobody + code],
-        env=without | environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-
-
-def test_without_a_home_directory_the_cache_is_a_private_folder_and_one_line_says_so(tmp_path):
-    code = "import jaxmpc, jax, identify.fmu\nprint(jax.config.jax_compilation_cache_dir, identify.fmu.cache_folder())"
-    run = in_a_new_process(code, TMPDIR=str(tmp_path))
-    assert run.returncode == 0
-    jit, fmu = map(Path, run.stdout.split())
-    assert jit.parent == fmu.parent
-    assert jit.parent.parent == tmp_path
-    assert mode_of(jit.parent) == 0o700
-    assert run.stderr.count("\n") == 1
-    assert str(jit.parent) in run.stderr
-    assert "JAXMPC_CACHE" in run.stderr
-
-
-def test_a_folder_for_temporary_files_that_others_may_write_is_not_trusted(tmp_path):
-    taken = tmp_path / f"jaxmpc-{os.getuid()}"
-    taken.mkdir()
-    taken.chmod(0o777)
-    code = "import jaxmpc, jax\nprint(jax.config.jax_compilation_cache_dir)"
-    folder = Path(in_a_new_process(code, TMPDIR=str(tmp_path)).stdout.strip()).parent
-    assert folder != taken
-    assert mode_of(folder) == 0o700

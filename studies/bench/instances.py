@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import io
 import time
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -20,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc import files
+from jaxmpc.cache import cache_folder, read_sealed, sealed
 from jaxmpc.case import Case, case_to_dict
 from jaxmpc.closed_loop import simulate
 from jaxmpc.controller import ContinuousController
@@ -39,14 +38,9 @@ from studies.fingerprint import content_hash
 Kind = Literal["continuous", "mixed-integer"]
 Mode = Literal["moves", "inputs"]
 MODES: tuple[Mode, ...] = ("moves", "inputs")
-RECORDING_FORMAT = 1
+RECORDING_FORMAT = 2
 WARM_UP = 20  # samples before the clock of a run starts
 FIELDS = ("setpoint", "cv", "move", "mv_demand", "gap", "fallback", "solve_time")
-
-
-def cache_folder() -> Path:
-    """Where recordings are kept, see `jaxmpc.files.cache_folder`."""
-    return files.cache_folder("bench")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -204,7 +198,7 @@ class Recordings:
             well_hash(WellPlant().parameters),
             self.reference.sample(self.model.dt, self.samples),
         )
-        return cache_folder() / f"{kind}-{mode}-{key[:20]}.npz"
+        return cache_folder("bench") / f"{kind}-{mode}-{key[:20]}.npz"
 
     def kept(self, kind: Kind, mode: Mode) -> Recording:
         """The recording in the cache, else the run made now; its problems stay the same from run to run."""
@@ -277,13 +271,13 @@ def _recording(run: Trajectory, wall_time: float) -> Recording:
 def _bytes(recording: Recording) -> bytes:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **dataclasses.asdict(recording))
-    return buffer.getvalue()
+    return sealed(buffer.getvalue())
 
 
 def _load(path: Path) -> Recording | None:
-    """A stored recording; None if there is none or it cannot be read."""
-    try:
-        with np.load(path) as stored:
-            return Recording(**{name: stored[name] for name in FIELDS}, wall_time=float(stored["wall_time"]))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    """A stored recording; None if there is none or it is damaged."""
+    content = read_sealed(path)
+    if content is None:
         return None
+    with np.load(io.BytesIO(content)) as stored:
+        return Recording(**{name: stored[name] for name in FIELDS}, wall_time=float(stored["wall_time"]))
