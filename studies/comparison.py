@@ -30,7 +30,15 @@ from jaxmpc.trajectory import Trajectory
 from jaxmpc.tuning import Tuning
 from studies.definition import ComparisonDefinition, ControllerDefinition
 from studies.fingerprint import content_hash, source_hash, versions
-from studies.store import FORMAT, ResultStore, open_results, provenance, results_template
+from studies.store import (
+    FORMAT,
+    RESULTS,
+    ResultStore,
+    open_results,
+    provenance,
+    results_template,
+    undamaged,
+)
 
 Say = Callable[[str], None]
 TUNING_AXES = {
@@ -118,20 +126,21 @@ def run_comparison(
 
 
 def is_current(definition: ComparisonDefinition, folder: Path) -> bool:
-    """Whether every run of a study is stored, made from this definition by today's code.
+    """Whether every run of a study is stored undamaged, made from this definition by today's code.
 
     Args:
         definition: of the study.
         folder: its results.
     """
+    if not undamaged(folder / RESULTS, range(len(definition.controllers))):
+        return False
     try:
         with open_results(folder) as data:
             # a stored definition is JSON: tuples are lists
             wanted = msgspec.json.decode(msgspec.json.encode(definition))
             code = provenance(data, "code")
             return (
-                bool((data.complete.values == 1).all())
-                and provenance(data, "definition") == wanted
+                provenance(data, "definition") == wanted
                 and isinstance(code, dict)
                 and bool(code)
                 and all(source_hash(package) == known for package, known in code.items())

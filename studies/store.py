@@ -1,9 +1,10 @@
 """The results of a study: one Zarr (v3) store per study, read as an `xarray.Dataset` with names and units.
 
 Layout: every trajectory variable has the axes ``controller, time`` and, where it has one, ``cv`` or ``mv``;
-one controller is one Zarr chunk and the only unit that is written. A controller's data land first and its
-``complete`` flag last, so a run that is killed leaves nothing that looks finished. The store itself appears
-in one rename. A store that answers another question (another ``study_hash``) is set aside under its own name,
+one controller is one Zarr chunk and the only unit that is written. A controller's data land first, its
+``complete`` flag next and the record of its files, with their checksums, last: a run that is killed leaves nothing
+that looks finished, and what is damaged later is computed again. The store itself appears in one rename. A store
+that is damaged otherwise, or answers another question (another ``study_hash``), is set aside under its own name,
 never overwritten, and what it or another study holds for an unchanged controller is taken over.
 """
 
@@ -14,7 +15,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ import xarray as xr
 
 from jaxmpc.errors import InputError
 from jaxmpc.trajectory import Trajectory
+from studies.sweep import records
+from studies.sweep.records import DamagedError
 
 RESULTS = "results.zarr"
 FORMAT = "jaxmpc/results/1"
@@ -50,6 +53,8 @@ VARIABLES: dict[str, tuple[str, str | None, str, Any, str, str]] = {
 PLAN = (
     "plan"  # over controller, time, block and mv; not a number in the blocks that a controller does not have
 )
+PER_CONTROLLER = (*VARIABLES, PLAN, "wall_time", "complete")  # one Zarr chunk for each controller
+FIXED = "fixed"  # the record of the files that belong to no controller; others have the index of theirs
 
 
 def check_writable(folder: str | Path, field: str = "out") -> Path:
@@ -174,9 +179,9 @@ def results_template(
 class ResultStore:
     """One study's store while it is being written; see the module for what is written when."""
 
-    def __init__(self, path: Path, controllers: list[str]):
+    def __init__(self, path: Path, controllers: list[str], say: Callable[[str], None]):
         """Use `begin`."""
-        self.path, self.controllers = path, controllers
+        self.path, self.controllers, self._say = path, controllers, say
 
     @classmethod
     def begin(
@@ -195,27 +200,35 @@ class ResultStore:
             controllers: their names, in the order of the store.
             study_hash: hash of everything that the results depend on.
             make_template: gives the study's `results_template`; called only if there is no such store yet.
-            say: receives a line when an older store is set aside or its results are taken over.
+            say: receives a line when an older store is set aside, its results are taken over, or results are damaged.
             others: stores of other studies, for a new store to take equal runs from.
         """
         path = folder / RESULTS
         for remains in folder.glob(f"{_UNFINISHED}*"):  # of a run that was killed while it made its store
             shutil.rmtree(remains, ignore_errors=True)
-        store = cls(path, controllers)
-        if path.exists() and _study_hash(path) == study_hash:
+        store = cls(path, controllers, say)
+        recorded = (path / _record(FIXED)).exists()  # a store of an older version has no record
+        damage = _damage(path, FIXED) if recorded else ""
+        known = None if damage else _study_hash(path)
+        if recorded and known == study_hash:
             return store
         template = make_template()
         if path.exists():
-            kept = _set_aside(path)
-            say(f"The results in {path} are of another definition or code; they are kept as {kept.name}.")
+            kept = _set_aside(path, known)
+            damaged = known in (None, study_hash)
+            why = f"damaged ({damage or 'unreadable'})" if damaged else "of another definition or code"
+            say(f"The results in {path} are {why}; they are kept as {kept.name}.")
         _write_new(path, template)
         store._take_over(template, [other for other in others if other != path], say)
         return store
 
     def complete(self, controller: str) -> bool:
-        """Whether every sample of the controller is stored."""
-        with xr.open_zarr(self.path, consolidated=False, chunks=None) as data:
-            return bool(data.complete.values[self.controllers.index(controller)])
+        """Whether every sample of the controller is stored and undamaged; damage is named."""
+        i = self.controllers.index(controller)
+        damage = _damage(self.path, i)
+        if damage and (self.path / _record(i)).exists():
+            self._say(f"{controller}: the results are damaged and are computed again ({damage}).")
+        return not damage
 
     def write(self, controller: str, trajectory: Trajectory, wall_time: float) -> None:
         """Store a finished run: data first, `complete` last.
@@ -245,9 +258,11 @@ class ResultStore:
     def _write_region(self, controller: str, data: xr.Dataset) -> None:
         i = self.controllers.index(controller)
         region = {"controller": slice(i, i + 1)}
+        (self.path / _record(i)).unlink(missing_ok=True)  # an old record never stands beside new data
         data.to_zarr(self.path, region=region, consolidated=False)
         done = xr.Dataset({"complete": (("controller",), np.ones(1, dtype="i1"))})
         done.to_zarr(self.path, region=region, consolidated=False)
+        _write_record(self.path, i)
 
     def _take_over(self, template: xr.Dataset, others: list[Path], say: Callable[[str], None]) -> None:
         """Copy controllers that an earlier store of this folder, or another study, holds with equal content hash."""
@@ -258,10 +273,12 @@ class ResultStore:
             if not wanted:
                 return
             try:
+                if (older / _record(FIXED)).exists() and (damage := _damage(older, FIXED)):
+                    raise ValueError(damage)
                 with open_results(older) as data:
                     hashes = data.content_hash.values.tolist()
                     for name, value in list(wanted.items()):
-                        if value in hashes and bool(data.complete.values[hashes.index(value)]):
+                        if value in hashes and undamaged(older, [hashes.index(value)]):
                             row = data.isel(controller=[hashes.index(value)])
                             fields = {key: row[key].variable for key in [*VARIABLES, "wall_time"]}
                             fields[PLAN] = xr.Variable(row[PLAN].dims, self._padded(row[PLAN].values))
@@ -318,6 +335,49 @@ def provenance(data: xr.Dataset, key: str) -> Any:
         return value
 
 
+def undamaged(path: Path, controllers: Iterable[int]) -> bool:
+    """Whether controllers of a store are finished and the files of the store are what was written.
+
+    Args:
+        path: of the store.
+        controllers: their indices.
+    """
+    return not any(_damage(path, of) for of in (FIXED, *controllers))
+
+
+def _record(of: int | str) -> str:
+    """Path of a record in the store: where Zarr looks for no array."""
+    return f"complete/files.{of}.json"
+
+
+def _owner(name: str) -> str:
+    """Which record a file of the store belongs to."""
+    array, _, rest = name.partition("/c/")
+    return rest.partition("/")[0] if rest and array in PER_CONTROLLER else FIXED
+
+
+def _write_record(path: Path, of: int | str) -> None:
+    names = (file.relative_to(path).as_posix() for file in sorted(path.rglob("*")) if file.is_file())
+    files = {
+        name: records.mark((path / name).read_bytes())
+        for name in names
+        if _owner(name) == str(of) and not name.startswith("complete/files.")
+    }
+    records.write_checked(path / _record(of), {"format": records.FORMAT, "files": files})
+
+
+def _damage(path: Path, of: int | str) -> str:
+    """What is wrong with the files of a controller, or with those that belong to none; empty if nothing is."""
+    try:
+        record = records.read_checked(path / _record(of))
+    except DamagedError as error:
+        return f"{_record(of)} {error}"
+    if record is None:
+        return f"{_record(of)} is missing"
+    wrong = records.changed(path, record["files"], deep=True)
+    return ", ".join(f"{name} {why}" for name, why in list(wrong.items())[:3])
+
+
 def _study_hash(path: Path) -> str | None:
     try:
         with open_results(path) as data:
@@ -326,9 +386,9 @@ def _study_hash(path: Path) -> str | None:
         return None
 
 
-def _set_aside(path: Path) -> Path:
+def _set_aside(path: Path, study_hash: str | None) -> Path:
     """Rename a store so that it keeps its content under a name that says which study it is."""
-    stem = f"results-{(_study_hash(path) or 'unreadable')[:10]}"
+    stem = f"results-{(study_hash or 'unreadable')[:10]}"
     target = path.with_name(f"{stem}.zarr")
     count = 1
     while target.exists():
@@ -341,11 +401,12 @@ def _set_aside(path: Path) -> Path:
 def _write_new(path: Path, template: xr.Dataset) -> None:
     """Write the store beside its place and rename it, so that it is there whole or not at all."""
     encoding = {}
-    for name in [*VARIABLES, PLAN, "wall_time", "complete"]:
+    for name in PER_CONTROLLER:
         encoding[name] = {"chunks": (1, *template[name].shape[1:])}
     temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=_UNFINISHED))
     try:
         template.to_zarr(temporary / RESULTS, zarr_format=3, consolidated=False, encoding=encoding)
+        _write_record(temporary / RESULTS, FIXED)
         os.rename(temporary / RESULTS, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

@@ -89,6 +89,79 @@ def test_a_damaged_store_is_set_aside_and_named(tmp_path):
     assert any("results-unreadable.zarr" in line for line in lines)
 
 
+def hurt(path, how):
+    content = bytearray(path.read_bytes())
+    if how == "deleted":
+        path.unlink()
+    elif how == "cut off":
+        path.write_bytes(content[: len(content) // 2])
+    elif how == "garbage":
+        path.write_bytes(b"garbage")
+    else:
+        content[len(content) // 2] ^= 4
+        path.write_bytes(content)
+
+
+def filled(folder, lines=None):
+    """The store with two of its runs; what is there already is not written again."""
+    results = begin(folder, lines=lines)
+    written = []
+    for name, kind in (("continuous-choke", "smooth"), ("step-choke", "hunting")):
+        if not results.complete(name):
+            results.write(name, made.trajectory(kind), 1.0)
+            written.append(name)
+    return written
+
+
+@pytest.mark.parametrize(
+    ("file", "how"),
+    [
+        ("position/c/1/0/0", "deleted"),
+        ("position/c/1/0/0", "cut off"),
+        ("position/c/1/0/0", "one bit"),
+        ("complete/c/1", "deleted"),
+        ("complete/files.1.json", "garbage"),
+    ],
+)
+def test_a_run_with_a_damaged_file_is_named_and_computed_again_and_the_others_stay(tmp_path, file, how):
+    assert filled(tmp_path) == ["continuous-choke", "step-choke"]
+    sound = open_results(tmp_path).load()
+    assert filled(tmp_path) == []
+    assert store.undamaged(tmp_path / store.RESULTS, range(2))
+    hurt(tmp_path / store.RESULTS / file, how)
+    assert not store.undamaged(tmp_path / store.RESULTS, range(2))
+    lines = []
+    assert filled(tmp_path, lines) == ["step-choke"]
+    assert store.undamaged(tmp_path / store.RESULTS, range(2))
+    xr.testing.assert_identical(open_results(tmp_path).load(), sound)
+    assert len(lines) == 1
+    assert lines[0].startswith("step-choke: the results are damaged")
+    assert file in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("file", "how"),
+    [
+        ("measurement/zarr.json", "deleted"),
+        ("setpoint/c/0/0", "one bit"),
+        ("complete/files.fixed.json", "cut off"),
+        ("complete/files.fixed.json", "deleted"),
+        ("zarr.json", "garbage"),
+    ],
+)
+def test_results_with_damage_that_concerns_all_runs_are_set_aside_and_computed_again(tmp_path, file, how):
+    filled(tmp_path)
+    sound = open_results(tmp_path).load()
+    hurt(tmp_path / store.RESULTS / file, how)
+    assert not store.undamaged(tmp_path / store.RESULTS, range(2))
+    lines = []
+    assert filled(tmp_path, lines) == ["continuous-choke", "step-choke"]
+    again = open_results(tmp_path).load()
+    xr.testing.assert_equal(again, sound)
+    assert lines[0].startswith(f"The results in {tmp_path / store.RESULTS} are damaged (")
+    assert len(list(tmp_path.glob("results-*.zarr"))) == 1
+
+
 def test_a_run_killed_while_it_writes_leaves_no_finished_run(tmp_path):
     script = """
         import os, signal, sys
