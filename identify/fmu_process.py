@@ -130,7 +130,8 @@ class FmuProcess:
         self._asked += 1
         try:
             self._channel.settimeout(self.time_limit)
-            self._channel.sendall(json.dumps({"n": self._asked, **request}).encode() + b"\n")
+            line = json.dumps({"n": self._asked, **request}, default=lambda value: value.item())  # of NumPy
+            self._channel.sendall(line.encode() + b"\n")
             reply = self._reply()
         except TimeoutError:
             raise self._failed(

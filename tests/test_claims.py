@@ -527,6 +527,13 @@ def test_steps_are_timed_once_and_then_read_from_a_file(tmp_path, monkeypatch):
         assert clock("continuous-choke").tolist() == [1e-3, 2e-3]
     assert calls == ["continuous-choke"]
     assert json.loads((tmp_path / "times.json").read_text()) == {"key": [1e-3, 2e-3]}
+    for damage in ('{"key": [1e-3, 2e', "", "[]", '{"key": ["soon"]}', '{"key": null}'):
+        (tmp_path / "times.json").write_text(damage)
+        said = []
+        clock = claims_study._Clock(study, tmp_path, tmp_path / "times.json", False, said.append)
+        assert clock("continuous-choke").tolist() == [1e-3, 2e-3]
+        assert said[0].startswith(f"{tmp_path / 'times.json'} is damaged and is measured anew (")
+        assert json.loads((tmp_path / "times.json").read_text()) == {"key": [1e-3, 2e-3]}
 
 
 def test_a_run_is_timed_on_the_host_over_its_first_part(monkeypatch):

@@ -11,6 +11,7 @@ import zipfile
 from pathlib import Path
 
 import fmpy
+import numpy as np
 import pytest
 
 from identify import fmu_worker
@@ -60,7 +61,7 @@ def test_reals_integers_and_booleans_are_set_held_over_the_steps_and_read(tmp_pa
             100 + 3 + (0.1 + 0.2),
         ]
         assert fmu.step(10.0, outputs=["time", "sum"], count=3) == [40.0, 100 + 3 + (0.1 + 0.2)]
-        fmu.set({"b": False, "n": -2})
+        fmu.set({"b": np.False_, "n": np.int64(-2)})
         assert fmu.get(["sum"]) == [0.1 + 0.2 - 2]
         fmu.start()
         assert fmu.get(["sum", "time"]) == [0.0, 0.0]
