@@ -30,7 +30,7 @@ def cache_folder(kind: str) -> Path:
         return _private(_private(root) / kind)
     except (OSError, RuntimeError) as error:  # RuntimeError: there is no home directory
         root = _temporary()
-        _say(f"no cache: {error}. {root} is used instead; JAXMPC_CACHE names another folder")
+        _say(f"the cache is in {root}: {str(error).rstrip('.')}; JAXMPC_CACHE moves it")
         os.environ["JAXMPC_CACHE"] = str(root)
         return _private(root / kind)
 
@@ -50,7 +50,7 @@ def _private(folder: Path) -> Path:
         if known.st_mode & 0o022:
             raise PermissionError(
                 f"{folder} can be written by others, and what is in a cache is run as code "
-                "(chmod 700 makes it private: do that only if you trust what is in it)"
+                "(remove it, or make it private with chmod 700 if you trust what is in it)"
             )
     if not os.access(folder, os.W_OK | os.X_OK):
         raise PermissionError(f"{folder} cannot be written")

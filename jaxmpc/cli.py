@@ -2,8 +2,9 @@
 
 This is the one module of `jaxmpc` that may import the other packages. Everything heavy is imported inside the
 command that needs it, so that ``--help`` and wrong options answer at once. Bad input ends with one line on
-standard error and exit status 2, a missing tool with status 1; nothing is written in either case. What the system
-refuses (a full disk, a reader that has left) ends with one line and status 1; faults of the program show themselves.
+standard error and exit status 2, a missing tool or a plant that fails with status 1; nothing is written in either
+case. What the system refuses (a full disk, a reader that has left) ends with one line and status 1; faults of the program
+show themselves.
 """
 
 from __future__ import annotations

@@ -92,7 +92,7 @@ def test_a_folder_that_others_can_fill_is_not_used(home, tmp_path, monkeypatch, 
     assert mode(instead) == mode(instead.parent) == 0o700
     assert list(instead.iterdir()) == []
     said = capsys.readouterr().err
-    assert said.startswith("jaxmpc: no cache: ")
+    assert said.startswith(f"jaxmpc: the cache is in {instead.parent}: ")
     assert reason in said
     assert said.count("\n") == 1
     assert cache_folder("fmu") == instead  # said once, also for processes that this one starts

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxmpc.cli import main
-from jaxmpc.errors import InputError, MissingToolError
+from jaxmpc.errors import InputError, MissingToolError, PlantError
 from tests import oracles, problems
 
 FIELDS = [
@@ -270,6 +270,18 @@ def test_a_missing_tool_ends_with_one_line_and_status_one(stub, capsys):
     stub("identify.fmu", build_fmu=build_fmu)
     assert main(["fmu", "build"]) == 1
     assert capsys.readouterr().err == "jaxmpc: no C compiler: install gcc\n"
+
+
+def test_a_plant_that_fails_ends_with_one_line_and_status_one(stub, tmp_path, capsys):
+    def crash(*_):
+        raise PlantError("well.fmu: the FMU ended its process with signal SIGABRT during doStep at t = 10 s")
+
+    stub("identify.step_test", identify_step_response=crash, settling_notes=list)
+    assert main(["identify", "--plant", "jax", "--out", str(tmp_path / "model.json")]) == 1
+    assert capsys.readouterr().err == (
+        "jaxmpc: well.fmu: the FMU ended its process with signal SIGABRT during doStep at t = 10 s\n"
+    )
+    assert not list(tmp_path.iterdir())
 
 
 def test_fmu_build_prints_where_the_fmu_is(stub, tmp_path, capsys):
