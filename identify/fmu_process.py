@@ -53,8 +53,12 @@ class FmuProcess:
     """
 
     def __init__(self, path: str | Path, time_limit: float = TIME_LIMIT):
-        if isinstance(time_limit, bool) or not isinstance(time_limit, (int, float)) or not time_limit > 0:
-            raise InputError("plant.time_limit", time_limit, "a positive number of seconds")
+        if (
+            isinstance(time_limit, bool)
+            or not isinstance(time_limit, (int, float))
+            or not 0 < time_limit <= 1e6
+        ):
+            raise InputError("plant.time_limit", time_limit, "a number of seconds above 0, at most 1e6")
         self.path, self.time_limit = Path(path), float(time_limit)
         if not self.path.is_file():
             raise InputError("plant.path", str(self.path), "an existing .fmu file")

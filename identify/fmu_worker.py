@@ -301,6 +301,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
     _leave_no_core()
     channel = socket.socket(fileno=int(sys.argv[1]))
+    channel.set_inheritable(False)  # a program that an FMU starts does not keep it open
     os.dup2(2, 1)  # what an FMU prints is no result of the command that uses it
     folder = Path(sys.argv[2])
     threading.Thread(target=_end_with_the_parent, args=[folder], daemon=True).start()

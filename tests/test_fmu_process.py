@@ -112,6 +112,10 @@ def test_a_file_of_the_folder_of_the_command_is_no_module_of_the_process(tmp_pat
         ("abort();", "ended its process with signal SIGABRT during doStep at t = 1230 s"),
         ("*(volatile int *)0 = 1;", "ended its process with signal SIGSEGV during doStep at t = 1230 s"),
         ("exit(0);", "ended its process with exit status 0 during doStep at t = 1230 s"),
+        (
+            'system("sleep 5 &"); abort();',
+            "ended its process with signal SIGABRT during doStep at t = 1230 s",
+        ),
         ("for (;;);", r"did not come back from doStep at t = 1230 s within 2 s; its process was ended"),
     ],
 )
@@ -165,7 +169,7 @@ def test_the_time_limit_is_for_one_call_and_not_for_all_steps_of_a_request(tmp_p
         assert step(fmu, count=5) == [2.0, 50.0]  # 1.5 s
 
 
-@pytest.mark.parametrize("limit", [0, -1.0, True, "long", math.nan])
+@pytest.mark.parametrize("limit", [0, -1.0, True, "long", math.nan, math.inf])
 def test_a_time_limit_that_is_no_time_is_refused(limit):
     with pytest.raises(InputError) as caught:
         FmuProcess("any.fmu", limit)
