@@ -7,13 +7,13 @@ interpolate continuous inputs between samples; the plant sets them and steps exp
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib.util
 import io
 import os
 import platform
 import shutil
-import subprocess
 import sys
 import tempfile
 import zipfile
@@ -27,6 +27,7 @@ from jaxmpc.actuator import check_actuator, move_choke
 from jaxmpc.cache import cache_folder, read_sealed, sealed
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.files import write_atomically
+from jaxmpc.interrupts import in_the_end, run_program
 from jaxmpc.plant import STATE_SCALE, WellOutputs, check_inputs
 from jaxmpc.well import DEFAULT_CHOKE, DEFAULT_LIFT, INPUTS, OUTPUTS, STATES, WellParameters, check_parameters
 
@@ -123,7 +124,8 @@ def _tools() -> dict[str, str]:
 def _compiled(contents: dict[str, str]) -> bytes:
     """Compile the sources in a temporary folder and return the zipped FMU."""
     environment = _tools()
-    with tempfile.TemporaryDirectory(prefix="jaxmpc-fmu-") as folder:
+    folder = tempfile.mkdtemp(prefix="jaxmpc-fmu-")
+    with in_the_end(functools.partial(shutil.rmtree, folder, ignore_errors=True)):
         tree, build = Path(folder, "fmu").resolve(), Path(folder, "build").resolve()
         build.mkdir()
         for name, content in contents.items():
@@ -135,13 +137,11 @@ def _compiled(contents: dict[str, str]) -> bytes:
             "from fmpy.build import build_platform_binary as build; "
             f"build({str(tree)!r}, {str(build)!r}, cmake_options={_cmake_options()!r})"
         )
-        done = subprocess.run(
-            [sys.executable, "-P", "-c", code], env=environment, capture_output=True, text=True, check=False
-        )
-        if done.returncode != 0:
+        status, said = run_program([sys.executable, "-P", "-c", code], environment)
+        if status != 0:
             raise MissingToolError(
                 "Building the FMU failed. A C compiler with its headers is needed (Debian or Ubuntu: "
-                f"apt install gcc libc6-dev make). Its last words:\n{(done.stdout + done.stderr)[-3000:]}"
+                f"apt install gcc libc6-dev make). Its last words:\n{said[-3000:]}"
             )
         archive = io.BytesIO()
         with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as zipped:

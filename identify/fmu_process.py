@@ -22,6 +22,7 @@ from typing import Any
 
 from identify.fmu_worker import NOTE, NOTE_BYTES, UNPACKED
 from jaxmpc.errors import InputError, PlantError
+from jaxmpc.interrupts import before_leaving
 
 TIME_LIMIT = 300.0  # s for one call of an FMU
 GOODBYE = 10.0  # s for an FMU to free itself
@@ -78,6 +79,7 @@ class FmuProcess:
                 process_group=0,  # Ctrl-C of a terminal goes to the group of the command
             )
         self._finalizer = weakref.finalize(self, _remove, self._process, self._channel, self.folder)
+        before_leaving(self._finalizer)
         try:
             facts = self._ask(load=str(self.path.absolute()))
         except BaseException:

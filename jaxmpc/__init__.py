@@ -9,6 +9,11 @@ to leave it off. The public names of its modules can be taken from the package i
 import os as _os
 from importlib import import_module as _import_module
 
+from jaxmpc import interrupts as _interrupts
+
+if _interrupts.is_command():  # before JAX, whose import takes a while
+    _interrupts.install()
+
 import jax as _jax
 
 from jaxmpc.cache import keep_programs as _keep_programs

@@ -19,14 +19,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from jaxmpc import interrupts
 from jaxmpc.errors import InputError, MissingToolError, PlantError
 from jaxmpc.files import check_folder, check_target, write_atomically
 from jaxmpc.options import COMPARISONS, parser
 
 EXIT_OPTIMAL, EXIT_OTHER, EXIT_BAD_INPUT, EXIT_INFEASIBLE, EXIT_LIMIT = 0, 1, 2, 3, 4
-EXIT_STOPPED = 130  # what shells report for Ctrl-C
 
 
+@interrupts.front_door
 def main(arguments: list[str] | None = None) -> int:
     """Run one command.
 
@@ -49,9 +50,8 @@ def main(arguments: list[str] | None = None) -> int:
         return _complain(error, EXIT_BAD_INPUT)
     except (MissingToolError, PlantError) as error:
         return _complain(error, EXIT_OTHER)
-    except KeyboardInterrupt:
-        print("jaxmpc: stopped", file=sys.stderr)
-        return EXIT_STOPPED
+    except KeyboardInterrupt as stop:
+        return interrupts.report(stop)
     except OSError as error:  # a full disk, a reader that has left, a name that is too long
         return _fail(error)
     except MemoryError as error:
@@ -59,7 +59,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _complain(error: object, status: int) -> int:
-    print("jaxmpc: " + " ".join(str(error).split()), file=sys.stderr)
+    if not interrupts.being_left():  # an extension that was being loaded makes an error of Ctrl-C
+        print("jaxmpc: " + " ".join(str(error).split()), file=sys.stderr)
     return status
 
 
@@ -363,8 +364,11 @@ def _bench(options: argparse.Namespace) -> int:
         check_folder("--figures", folder)
     from studies.bench.run import run_bench, table, wrong
 
-    report = run_bench(quick=options.quick, only=only, json_path=out)
-    print(table(report), end="", flush=True)
+    def show(report: Any) -> None:
+        print(table(report), end="", flush=True)
+
+    report = run_bench(quick=options.quick, only=only, json_path=out, stopped=show)
+    show(report)
     if folder is not None:
         from figures.benchmark import draw_benchmark
 

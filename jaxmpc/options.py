@@ -258,7 +258,7 @@ def _bench(commands: _Commands) -> None:
         "Time our solvers beside others on recorded samples of the thesis run, and check every solution.",
         epilog="Times are wall times [ms] or [s], rates are per second. The other solvers come with pip install "
         "'jaxmpc[bench]'; one that is not installed is named as missing. Ctrl-C prints what was measured so far. "
-        "Exit status: 0 done, 2 bad input, 1 stopped early or one of our solutions is wrong.",
+        "Exit status: 0 done, 2 bad input, 130 stopped by Ctrl-C, 1 ended early or one of our solutions is wrong.",
     )
     bench.add_argument(
         "--quick",

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from jaxmpc.condense import QpInstance
+from jaxmpc.interrupts import being_left
 from jaxmpc.relaxer import Relaxer
 from jaxmpc.search import Offload, Request, Search, SearchResult, Steps
 
@@ -78,7 +79,7 @@ def run(
                     one.send(value)
     finally:
         if pool is not None:
-            pool.shutdown(cancel_futures=True)
+            pool.shutdown(wait=not being_left(), cancel_futures=True)
     return [one.result for one in runs if one.result is not None]
 
 

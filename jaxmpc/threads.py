@@ -16,6 +16,8 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
+from jaxmpc.interrupts import being_left
+
 T = TypeVar("T")
 THREADS = "JAXMPC_THREADS"  # environment variable with the number of threads
 
@@ -52,13 +54,12 @@ def side_by_side(work: Callable[[T, Callable[[], bool]], Any], parts: Sequence[T
     stopped = threading.Event()
     if len(parts) == 1 or cores() == 1:
         return [work(part, stopped.is_set) for part in parts]
-    with concurrent.futures.ThreadPoolExecutor(min(cores(), len(parts))) as pool:
+    pool = concurrent.futures.ThreadPoolExecutor(min(cores(), len(parts)))
+    try:
         futures = [pool.submit(work, part, stopped.is_set) for part in parts]
-        try:
-            for future in concurrent.futures.as_completed(futures):
-                future.result()
-        except BaseException:
-            stopped.set()
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    return [future.result() for future in futures]
+        for future in concurrent.futures.as_completed(futures):
+            future.result()
+        return [future.result() for future in futures]
+    finally:
+        stopped.set()
+        pool.shutdown(wait=not being_left(), cancel_futures=True)

@@ -121,14 +121,19 @@ def _fail(folder):
 
 def _kill_main(folder):
     os.kill(_main_process(), signal.SIGKILL)
-    time.sleep(120)
+    _wait_for_the_end()
 
 
 def _interrupt(folder):
     """What Ctrl-C in a terminal does: every process of the group gets it."""
     os.killpg(os.getpgid(0), signal.SIGINT)
-    if multiprocessing.parent_process() is not None:
-        time.sleep(120)
+    _wait_for_the_end()
+
+
+def _wait_for_the_end():
+    """Until a signal that was sent arrives and ends this process; the run must not be over before that."""
+    while True:
+        time.sleep(0.05)
 
 
 def _kill_scheduler(folder):
@@ -164,7 +169,8 @@ def main() -> None:
     from jaxmpc import cli
     from studies.sweep import runner
 
-    hazard, index, folder, *arguments = sys.argv[1:]
+    program, hazard, index, folder, *arguments = sys.argv
+    sys.argv = [program, *arguments]
     runner.prepare_study = preparation(hazard, int(index), folder)
     figures.sweep.draw_sweep = lambda store, folder: []
-    sys.exit(cli.main(arguments))
+    sys.exit(cli.main())

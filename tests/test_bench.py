@@ -293,11 +293,14 @@ def test_an_interrupt_leaves_the_rows_so_far(tmp_path, monkeypatch):
     monkeypatch.setitem(run.SECTIONS, "relaxed", stopped)
     monkeypatch.setitem(run.SECTIONS, "batch", lambda context: pytest.fail("went on"))
     path = tmp_path / "bench.json"
-    report = measure("relaxed,batch", json_path=path)
-    assert not report.complete
+    kept = []
+    with pytest.raises(KeyboardInterrupt):
+        measure("relaxed,batch", json_path=path, stopped=kept.append)
     body = json.loads(path.read_text())
     assert body["complete"] is False
     assert [row["name"] for row in body["rows"]] == ["done"]
+    (report,) = kept
+    assert not report.complete
     assert "Not complete" in rows.table(report)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
+from jaxmpc.interrupts import last_words
 from studies.bench.context import FULL, QUICK, Context, Size
 from studies.bench.peers import MIQP_PEERS, QP_PEERS, Peer
 from studies.bench.rows import Report, Row, table
@@ -56,8 +57,9 @@ def run_bench(
     size: Size | None = None,
     peers: tuple[tuple[Peer, ...], tuple[Peer, ...]] = (QP_PEERS, MIQP_PEERS),
     say: Callable[[str], None] | None = None,
+    stopped: Callable[[Report], object] | None = None,
 ) -> Report:
-    """Measure, and return what was measured; an interrupt or an error ends it early with the rows so far.
+    """Measure, and return what was measured; an error ends a section early with the rows so far.
 
     Args:
         quick: a few problems of a short run, under two minutes.
@@ -66,12 +68,14 @@ def run_bench(
         size: how much is measured, if neither the full nor the quick amount.
         peers: QP and MIQP solvers to compare with; ratios are to the first of each.
         say: receives lines of progress; standard error if not given.
+        stopped: receives what was measured before Ctrl-C.
 
     Returns:
-        `Report`; `complete` is False if it ended early.
+        `Report`; `complete` is False if a section ended early.
 
     Raises:
         InputError: for an unknown section, before anything is measured.
+        KeyboardInterrupt: after Ctrl-C; the rows so far are written and given to `stopped`.
     """
     names = chosen_sections(only)
     begin = time.perf_counter()
@@ -82,14 +86,19 @@ def run_bench(
     context = Context(size or (QUICK if quick else FULL), quick, say or progress, *peers)
     report = Report(machine=machine(peers), options={"quick": quick, "sections": names})
     report.series = context.series
-    complete = True
-    try:
+
+    def keep() -> str:
+        _write(report, json_path)
+        if stopped is not None:
+            stopped(report)
+        return ""
+
+    with last_words(keep):
+        complete = True
         for name in names:
             complete &= _section(name, context, report)
             _write(report, json_path)
-        report.complete = complete
-    except KeyboardInterrupt:
-        (say or progress)("interrupted")
+    report.complete = complete
     _write(report, json_path)
     return report
 

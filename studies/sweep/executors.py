@@ -16,11 +16,12 @@ import platform
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Protocol
 
 from jaxmpc.errors import InputError, MissingToolError
+from jaxmpc.interrupts import held
 from jaxmpc.threads import THREADS, cores
 from studies.sweep.chunk import ChunkResult, PreparedStudy, run_chunk
 from studies.sweep.scenarios import code_hash
@@ -128,7 +129,7 @@ class Processes:
 
     def submit(self, index: int) -> concurrent.futures.Future[ChunkResult]:
         """As in `Executor`; starts the processes as they are needed."""
-        with _interrupts_blocked():
+        with held():  # Ctrl-C goes to all processes of a terminal
             try:
                 return self.pool.submit(_run_received, index)
             except BrokenProcessPool:
@@ -147,19 +148,6 @@ class Processes:
             process.terminate()
         for process in processes:
             process.join()
-
-
-@contextlib.contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Processes started meanwhile never see Ctrl-C, which goes to the whole terminal; here it counts afterwards."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 # ----------------------------------------------------------------------------------------------------------- dask

@@ -15,6 +15,7 @@ from typing import Any
 from tqdm import tqdm
 
 from jaxmpc.errors import InputError
+from jaxmpc.interrupts import last_words
 from studies.sweep.chunk import ChunkResult, PreparedStudy, prepare_study, study_layout
 from studies.sweep.executors import Cluster, Executor, Here, LostError, Processes, connect, disconnect
 from studies.sweep.progress import progress_bar
@@ -62,7 +63,7 @@ def run_study(
             disk; what is stored stays.
         MissingToolError: if `dask` is asked for and not installed.
         RunError: naming the chunks that failed, after all others are stored, or the cluster that was lost.
-        KeyboardInterrupt: after Ctrl-C, once the workers are stopped.
+        KeyboardInterrupt: after Ctrl-C, once the workers are stopped; says how much is stored.
     """
     if isinstance(workers, bool) or not isinstance(workers, int) or workers < 1:
         raise InputError("workers", workers, "1 or more processes")
@@ -80,19 +81,16 @@ def run_study(
         failed: dict[int, BaseException] = {}
         try:
             if missing:
-                prepared = prepare_study(study)
                 done = chunk_facts(writer.path)
                 stored = sum(len(study.chunks[i].scenarios) for i in done)
                 with (
-                    _executor(prepared, workers, client, say) as executor,
+                    last_words(lambda: f"{_stored(study, writer)} Give the same command again to go on."),
+                    _executor(prepare_study(study), workers, client, say) as executor,
                     progress_bar(study.name, study.count, stored, study.work, done, progress) as bar,
                 ):
                     for result in _results(executor, missing, failed, say):
                         writer.commit(result.index, result.fields, result.facts)
                         bar.add(result.index, result.facts, len(study.chunks[result.index].scenarios))
-        except KeyboardInterrupt:
-            say(f"Stopped. {_stored(study, writer)} Give the same command again to go on.")
-            raise
         except LostError as error:
             raise RunError(
                 f"Stopped: {error}. {_stored(study, writer)} Give the same command again, also with other workers, "

@@ -68,7 +68,7 @@ def run_search(
     Raises:
         InputError: for bad arguments, a store that another run holds, or a full disk; what is stored stays.
         MissingToolError: if optuna is not installed; nothing is written.
-        KeyboardInterrupt: after Ctrl-C; the batches stored so far stay.
+        KeyboardInterrupt: after Ctrl-C; says how many batches are stored.
     """
     hint = "Every batch waits for the one before it; a larger study.chunk_size uses more cores"
     if isinstance(workers, bool) or workers != 1:
@@ -80,19 +80,19 @@ def run_search(
         missing = set(writer.pending())
         done = study.batches - len(missing)
         if done:
-            say(f"{done} of {study.batches} batches are stored already.")
-        try:
-            facts, work = chunk_facts(writer.path), study.work
-            with progress_bar(study.name, study.count, done * study.chunk_size, work, facts, progress) as bar:
-                _search(study, sampler, writer, missing, bar, say)
-        except KeyboardInterrupt:
-            done = study.batches - len(writer.pending())
-            say(
-                f"Stopped: {done} of {study.batches} batches are stored. Give the same command again to go on."
-            )
-            raise
+            say(_stored_batches(study, writer))
+        facts, work = chunk_facts(writer.path), study.work
+        with (
+            last_words(lambda: f"{_stored_batches(study, writer)} Give the same command again to go on."),
+            progress_bar(study.name, study.count, done * study.chunk_size, work, facts, progress) as bar,
+        ):
+            _search(study, sampler, writer, missing, bar, say)
         say(f"{study.count} scenarios, {len(front(writer.path))} on the front: {writer.path}")
         return writer.path
+
+
+def _stored_batches(study: SearchStudy, writer: SweepStore) -> str:
+    return f"{study.batches - len(writer.pending())} of {study.batches} batches are stored."
 
 
 def _search(
