@@ -27,8 +27,6 @@ TIDY = (
     0.5  # s for each of the last things to do, such as that the reader of standard output takes what is left
 )
 
-Main = Callable[[list[str] | None], int]
-
 
 class _Exit:
     """How this process ends after Ctrl-C; installed in the process of a command only."""
@@ -137,7 +135,7 @@ def install() -> None:
     _exit.install()
 
 
-def front_door(main: Main) -> Main:
+def front_door(main: Callable[[list[str] | None], int]) -> Callable[..., int]:
     """A main function that ends the process after Ctrl-C, where it is called for the words of the process."""
 
     @functools.wraps(main)
@@ -236,10 +234,17 @@ def run_program(words: list[str], environment: dict[str, str]) -> tuple[int, str
     Returns:
         Exit status, and what it printed.
     """
-    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     with contextlib.ExitStack() as stack:
         with held():
-            process = subprocess.Popen(words, env=environment, text=True, start_new_session=True, **pipes)
+            process = subprocess.Popen(
+                words,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                start_new_session=True,
+            )
             stack.enter_context(in_the_end(functools.partial(_end, process)))
         said, _ = process.communicate()
         return process.returncode, said

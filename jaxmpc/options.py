@@ -242,6 +242,8 @@ def _explore(commands: _Commands) -> None:
         "explore",
         "Tune a controller with sliders in the browser, and look into the store of any study; needs "
         "pip install 'jaxmpc[notebook]'.",
+        epilog="The address that it prints has a token, without which nobody is let in; the server listens on this "
+        "machine only. Exit status: 2 bad input, 130 stopped by Ctrl-C, 1 anything else.",
     )
     app.add_argument(
         "--store", metavar="PATH", type=Path, default=None, help="study to open on the second page"
@@ -249,7 +251,7 @@ def _explore(commands: _Commands) -> None:
     app.add_argument(
         "--port", metavar="N", type=int, default=None, help="of the local server (default: a free one)"
     )
-    app.add_argument("--headless", action="store_true", help="only serve, open no browser")
+    app.add_argument("--headless", action="store_true", help="only serve and print the address")
 
 
 def _bench(commands: _Commands) -> None:

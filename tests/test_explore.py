@@ -1,6 +1,10 @@
 """The interactive app: what it computes, what it draws, how it is started, and a browser that drives it."""
 
+import contextlib
+import html
+import http.client
 import importlib.util
+import json
 import os
 import shutil
 import signal
@@ -8,12 +12,15 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
+from urllib.parse import urlsplit
 
 import jax
 import numpy as np
 import pytest
 
 from figures import explore as draw
+from jaxmpc import cli
 from jaxmpc.errors import InputError, MissingToolError
 from studies import explore
 from studies.explore import RUN, Settings, main, run, shown_figures, written
@@ -287,18 +294,6 @@ def test_what_is_no_store_is_refused(tmp_path):
 # --------------------------------------------------------------------------------------------------- starting
 
 
-def test_the_app_is_started_with_port_and_store(monkeypatch, sweep):
-    called = []
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name)
-    monkeypatch.setattr(subprocess, "call", lambda words: called.append(words) or 0)
-    assert launch.explore(8123, True, sweep) == 0
-    (words,) = called
-    assert words[words.index("--port") + 1] == "8123"
-    assert words[-3:] == ["--", "--store", str(sweep)]
-    assert "--headless" in words
-    assert launch.APP.is_file()
-
-
 def test_a_port_or_store_that_does_not_exist_is_refused(tmp_path):
     with pytest.raises(InputError, match="port"):
         launch.explore(0)
@@ -310,6 +305,207 @@ def test_a_missing_marimo_is_named_with_what_to_install(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingToolError, match=r"pip install 'jaxmpc\[notebook\]'"):
         launch.explore()
+
+
+# ----------------------------------------------------------------------------------------------------- server
+
+
+SERVED = pytest.mark.skipif(
+    any(importlib.util.find_spec(name) is None for name in ("marimo", "altair")),
+    reason="not installed: marimo",
+)
+
+
+@contextlib.contextmanager
+def serving(log, *options, **environment):
+    """``jaxmpc explore`` in a process of its own: the process, and the address that it prints."""
+    words = [sys.executable, "-m", "jaxmpc.cli", "explore", *map(str, options)]
+    with open(log, "w") as errors:
+        server = subprocess.Popen(
+            words, stdout=subprocess.PIPE, stderr=errors, text=True, env={**os.environ, **environment}
+        )
+    try:
+        assert server.stdout is not None
+        line = server.stdout.readline()
+        assert line.startswith("jaxmpc: http://127.0.0.1:"), log.read_text()
+        yield server, line.split()[1]
+    finally:
+        server.kill()
+        server.communicate()
+
+
+@pytest.fixture(scope="module")
+def address(sweep, tmp_path_factory):
+    with serving(tmp_path_factory.mktemp("server") / "log", "--headless", "--store", sweep) as (_, found):
+        yield urlsplit(found)
+
+
+def ask(address, path, method="GET", **headers):
+    """Status, headers and body of an answer; a header that is None is left out."""
+    connection = http.client.HTTPConnection("127.0.0.1", address.port, timeout=60)
+    connection.putrequest(method, path, skip_host=True)
+    for name, value in {"Host": address.netloc, **headers}.items():
+        if value is not None:
+            connection.putheader(name.replace("_", "-"), value)
+    connection.endheaders()
+    with contextlib.closing(connection):
+        answer = connection.getresponse()
+        return answer.status, answer.headers, answer.read()
+
+
+def cookie_of(address):
+    """What the browser of the user holds once it has opened the address."""
+    status, headers, _ = ask(address, f"/?{address.query}")
+    assert status == 200
+    assert {"HttpOnly", "SameSite=Strict"} <= set(headers["Set-Cookie"].split("; "))
+    return headers["Set-Cookie"].split(";")[0]
+
+
+FOREIGN = [
+    {"Origin": "http://evil.example"},
+    {"Origin": "null"},
+    {"Origin": "https://127.0.0.1"},
+    {"Host": "evil.example"},
+    {"Host": None},
+    {"Host": "127.0.0.1"},
+    {"Host": "evil.example", "Origin": "http://evil.example"},
+]
+PATHS = ["/", "/auth/login", "/health", "/api/version", "/assets/", "/@file/x", "/openapi.json"]
+
+
+@SERVED
+@pytest.mark.parametrize("path", PATHS)
+def test_nothing_is_served_without_the_token(path, address):
+    assert ask(address, path)[0] == 403
+    assert ask(address, f"{path}?token=wrong")[0] == 403
+    assert ask(address, f"{path}?access_token={address.query.partition('=')[2]}")[0] == 403
+    assert ask(address, path, Cookie=cookie_of(address) + "x")[0] == 403
+
+
+@SERVED
+def test_what_browsers_ask_for_without_their_cookies_is_answered_and_says_nothing(address):
+    status, _, body = ask(address, "/manifest.json")
+    assert (status, json.loads(body)) == (200, {"name": "jaxmpc explore"})
+    assert ask(address, "/manifest.json", Origin="http://evil.example")[0] == 403
+
+
+@SERVED
+@pytest.mark.parametrize("foreign", FOREIGN)
+def test_a_page_of_another_site_is_refused_also_with_the_token(foreign, address):
+    for path in ("/", "/api/kernel/set_ui_element_value"):
+        for method in ("GET", "POST", "OPTIONS"):
+            status, headers, body = ask(address, f"{path}?{address.query}", method, **foreign)
+            assert status in (400, 403)  # a server may refuse a request without a host by itself
+            assert len(body) < 200
+            assert "Access-Control-Allow-Origin" not in headers
+
+
+@SERVED
+def test_controls_are_not_moved_without_the_token(address):
+    path, own = "/api/kernel/set_ui_element_value", f"http://{address.netloc}"
+    assert ask(address, path, "POST", Origin=own)[0] == 403
+    cookie = cookie_of(address)
+    assert ask(address, path, "POST", Cookie=cookie, Sec_Fetch_Site="same-site")[0] == 403
+    assert ask(address, path, "POST", Cookie=cookie, Sec_Fetch_Site="same-origin", Origin=own)[0] != 403
+
+
+@SERVED
+def test_the_token_opens_the_app_and_the_cookie_keeps_it_open(address):
+    status, _, body = ask(address, f"/?{address.query}")
+    assert (status, b"jaxmpc explore" in body) == (200, True)
+    named = address._replace(netloc=f"localhost:{address.port}")
+    assert ask(named, f"/?{address.query}", Origin=f"http://localhost:{address.port}")[0] == 200
+    status, headers, body = ask(address, "/", Cookie=cookie_of(address), Sec_Fetch_Site="none")
+    assert (status, b"jaxmpc explore" in body) == (200, True)
+    assert "Set-Cookie" not in headers
+
+
+def listen(address, query, headers, origin=None):
+    """The first message of a WebSocket, or the status that refuses it."""
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    uri = f"ws://127.0.0.1:{address.port}/ws?session_id=s_{os.urandom(4).hex()}{query}"
+    host = headers.pop("Host", None)
+    if host is not None:
+        uri = uri.replace(f"127.0.0.1:{address.port}", host)
+    with socket.create_connection(("127.0.0.1", address.port)) as connection:
+        try:
+            with connect(
+                uri, sock=connection, origin=origin, additional_headers=headers, proxy=None
+            ) as opened:
+                return opened.recv(60)
+        except InvalidStatus as refused:
+            return refused.response.status_code
+
+
+@SERVED
+def test_a_websocket_is_refused_without_the_token_and_to_other_sites(address):
+    pytest.importorskip("websockets")
+    cookie, own, token = cookie_of(address), f"http://{address.netloc}", f"&{address.query}"
+    assert listen(address, "", {}) == 403
+    assert listen(address, "", {}, own) == 403
+    assert listen(address, "&token=wrong", {}, own) == 403
+    assert listen(address, "", {"Cookie": cookie}, "http://evil.example") == 403
+    assert listen(address, token, {}, "http://evil.example") == 403
+    assert listen(address, token, {"Host": f"evil.example:{address.port}"}) == 403
+    assert listen(address, "", {"Cookie": cookie, "Sec-Fetch-Site": "same-site"}) == 403
+    assert "kernel-ready" in listen(address, "", {"Cookie": cookie}, own)
+    assert "kernel-ready" in listen(address, token, {})
+
+
+@SERVED
+def test_the_app_is_served_on_the_loopback_interface_only_and_ends_with_its_process(tmp_path):
+    for number, status in ((signal.SIGINT, 130), (signal.SIGTERM, -signal.SIGTERM), (signal.SIGKILL, -9)):
+        log = tmp_path / "log"
+        with serving(log, "--headless") as (server, found):
+            port = urlsplit(found).port
+            with socket.socket() as elsewhere:
+                elsewhere.bind(("127.0.0.2", port))  # of all interfaces it would be in use
+            assert ask(urlsplit(found), "/")[0] == 403
+            server.send_signal(number)
+            assert server.wait(60) == status
+            with socket.socket() as probe:
+                assert probe.connect_ex(("127.0.0.1", port)) != 0
+        assert log.read_text() == ("jaxmpc: stopped\n" if number == signal.SIGINT else "")
+
+
+@SERVED
+def test_a_port_that_is_in_use_is_refused_before_anything_is_served(capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        assert cli.main(["explore", "--headless", "--port", port]) == 2
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err.count("\n")) == ("", 1)
+    assert port in captured.err
+
+
+@SERVED
+def test_the_browser_is_sent_to_the_address_which_no_argument_of_a_program_holds(tmp_path):
+    seen, home = tmp_path / "seen", tmp_path / "home"
+    home.mkdir()
+    browser = tmp_path / "browser"
+    browser.write_text(f'#!/bin/sh\necho "$@" > "{seen}.part" && mv "{seen}.part" "{seen}"\n')
+    browser.chmod(0o755)
+    with serving(tmp_path / "log", HOME=str(home), BROWSER=str(browser)) as (server, found):
+        until(seen.exists)
+        page = Path(urlsplit(seen.read_text().strip()).path)
+        assert html.escape(found) in page.read_text()
+        assert page.parent.stat().st_mode & 0o077 == 0
+        arguments = Path(f"/proc/{server.pid}/cmdline")
+        shown = arguments.read_text() if arguments.exists() else ""
+        assert urlsplit(found).query.partition("=")[2] not in seen.read_text() + shown
+        assert ask(urlsplit(found), f"/?{urlsplit(found).query}")[0] == 200
+        until(lambda: list(home.glob("jaxmpc-*")) == [])
+
+
+def until(condition, seconds=300):
+    """Wait for what is to be seen; a limit only for what never comes."""
+    end = time.monotonic() + seconds
+    while not (found := condition()):
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    return found
 
 
 # ---------------------------------------------------------------------------------------------------- browser
@@ -350,15 +546,6 @@ class Page:
             "return (document.querySelector(`img[alt='${arguments[0]}']`) || {}).src || ''", name
         )
 
-    def until(self, condition, seconds=100):
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            found = condition()
-            if found:
-                return found
-            time.sleep(0.1)
-        raise AssertionError(f"not within {seconds} s")
-
     def move_slider(self, label, key):
         thumb = self.script(
             "return arguments[0].shadowRoot.querySelector('[role=slider]')", self.find("slider", label)
@@ -370,14 +557,11 @@ class Page:
         self.script("arguments[0].shadowRoot.querySelector('button').click()", self.find("button", label))
 
     def find(self, kind, label):
-        return self.until(lambda: self.script(FIND, f"marimo-{kind}", label))
+        return until(lambda: self.script(FIND, f"marimo-{kind}", label))
 
 
 @pytest.fixture
-def page(sweep, tmp_path):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+def page(address):
     from selenium import webdriver
 
     options = webdriver.ChromeOptions()
@@ -385,27 +569,12 @@ def page(sweep, tmp_path):
     for word in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1280,943"):
         options.add_argument(word)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    with open(tmp_path / "server.log", "w") as log:
-        server = subprocess.Popen(
-            launch.command(port, True, sweep), stdout=log, stderr=log, start_new_session=True
-        )
-        try:
-            driver = webdriver.Chrome(options, webdriver.ChromeService(shutil.which("chromedriver")))
-            try:
-                shown = Page(driver)
-                shown.until(lambda: _answers(port))
-                driver.get(f"http://127.0.0.1:{port}")
-                yield shown
-            finally:
-                driver.quit()
-        finally:
-            os.killpg(server.pid, signal.SIGTERM)
-            server.wait(30)
-
-
-def _answers(port):
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
+    driver = webdriver.Chrome(options, webdriver.ChromeService(shutil.which("chromedriver")))
+    try:
+        driver.get(address.geturl())
+        yield Page(driver)
+    finally:
+        driver.quit()
 
 
 @pytest.mark.skipif(bool(_missing()), reason=f"not installed: {_missing()}")
@@ -413,31 +582,31 @@ def test_in_a_browser_a_slider_changes_figure_and_key_figures_and_a_point_shows_
     from selenium.webdriver.common.action_chains import ActionChains
     from selenium.webdriver.common.keys import Keys
 
-    page.until(lambda: page.figures() and page.image("the run") and page.image("the plan"))
+    until(lambda: page.figures() and page.image("the run") and page.image("the plan"))
     before, drawn, planned = page.figures(), page.image("the run"), page.image("the plan")
     page.press("Pin this run")
-    page.until(lambda: "pinned" in page.figures())
-    page.until(lambda: page.image("the run") != drawn)
+    until(lambda: "pinned" in page.figures())
+    until(lambda: page.image("the run") != drawn)
     pinned, drawn = page.figures(), page.image("the run")
     page.move_slider("oil deadzone", Keys.HOME)
-    page.until(lambda: page.figures() != pinned and page.image("the run") != drawn)
-    page.until(lambda: page.image("the plan") != planned)
+    until(lambda: page.figures() != pinned and page.image("the run") != drawn)
+    until(lambda: page.image("the plan") != planned)
     travel = before.splitlines()[1].split("\t")[1]
     assert page.figures().splitlines()[1].split("\t")[2] == travel  # the pinned run stays
     planned, run_before = page.image("the plan"), page.image("the run")
     page.move_slider("plan made at", Keys.ARROW_RIGHT)
-    page.until(lambda: page.image("the plan") != planned)
+    until(lambda: page.image("the plan") != planned)
     assert page.image("the run") == run_before
     page.driver.save_screenshot(str(tmp_path / "run.png"))
 
     page.script(SECOND_PAGE)
-    at = page.until(lambda: page.script(POINTS))
+    at = until(lambda: page.script(POINTS))
     assert len(at) == 4
     ActionChains(page.driver).move_by_offset(*map(int, at[0])).click().perform()
-    page.until(lambda: page.image("the picked run"))
+    until(lambda: page.image("the picked run"))
     page.driver.save_screenshot(str(tmp_path / "study.png"))
     wrong = [entry["message"] for entry in page.driver.get_log("browser") if entry["level"] == "SEVERE"]
-    assert wrong == []
+    assert "\n".join(wrong) == ""
 
 
 @pytest.mark.skipif(importlib.util.find_spec("marimo") is None, reason="not installed: marimo")

@@ -1,5 +1,6 @@
 """Sweep studies from the command line: options, exit status, and that a run goes on after anything that ends it."""
 
+import contextlib
 import json
 import os
 import re
@@ -88,11 +89,12 @@ def alive(pid):
         return False
 
 
-def wait_until_ended(pids, seconds=30):
-    end = time.monotonic() + seconds
-    while any(map(alive, pids)) and time.monotonic() < end:
+def wait_until_ended(pids):
+    """A limit only for what never comes."""
+    end = time.monotonic() + 300
+    while any(map(alive, pids)):
+        assert time.monotonic() < end
         time.sleep(0.1)
-    assert not any(map(alive, pids))
 
 
 # ------------------------------------------------------------------------------------------------ a run that ends
@@ -125,7 +127,7 @@ def test_ctrl_c_ends_a_run_with_status_130_and_what_to_do(workers, file, serial,
         r"jaxmpc: stopped: [012] of 3 chunks are stored\. Give the same command again .*", last
     )
     assert "Traceback" not in out + err
-    wait_until_ended(processes(tmp_path), 5)
+    wait_until_ended(processes(tmp_path))
     status, _, err = finish(start(command, tmp_path, "none"))
     assert (status, "Traceback" in err) == (0, False)
     same(store, serial)
@@ -407,10 +409,12 @@ def cluster(tmp_path):
     ]
     (tmp_path / "scheduler.pid").write_text(str(begun[0].pid))
     try:
-        end = time.monotonic() + 60
-        while not found.exists() and time.monotonic() < end:
+        address = None
+        while address is None:  # a file that appears may be half written
+            assert begun[0].poll() is None
+            with contextlib.suppress(FileNotFoundError, json.JSONDecodeError):
+                address = json.loads(found.read_text())["address"]
             time.sleep(0.1)
-        address = json.loads(found.read_text())["address"]
         for _ in range(2):
             worker = ["distributed.cli.dask_worker", address, *local, "--no-nanny", "--nthreads", "1"]
             begun.append(subprocess.Popen([*python, *worker], **quiet))

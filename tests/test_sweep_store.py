@@ -500,9 +500,9 @@ def test_two_writers_are_refused_and_a_killed_one_leaves_no_lock(tmp_path):
     script = """
         store = t.SweepStore.begin(sys.argv[1], t.layout())
         print("open", flush=True)
-        time.sleep(60)
+        signal.pause()
     """
-    body = "import sys, time\nfrom tests import test_sweep_store as t\n" + textwrap.dedent(script)
+    body = "import signal, sys\nfrom tests import test_sweep_store as t\n" + textwrap.dedent(script)
     writer = subprocess.Popen(
         [sys.executable, "-c", body, str(path)], cwd=ROOT, stdout=subprocess.PIPE, text=True
     )

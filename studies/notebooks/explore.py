@@ -26,7 +26,8 @@ def _(mo):
 
     # Ratios to the preset's own value, so that one slider serves values of any size.
     RATIOS = [2.0**k for k in range(-5, 6)]
-    given_store = str(mo.cli_args().get("store") or "")
+    _request = mo.app_meta().request
+    given_store = str(_request.meta.get("store", "")) if _request is not None else ""
     return InputError, RATIOS, draw, explore, given_store, html, presets
 
 

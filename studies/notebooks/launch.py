@@ -1,19 +1,34 @@
-"""Starts the interactive app in the browser; the command ``jaxmpc explore`` calls it."""
+"""Serves the interactive app to one user on this machine; the command ``jaxmpc explore`` calls it.
+
+The server is part of this process, so that it ends with it however that happens. Its address holds a token, see `guard`.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import html
 import importlib.util
-import subprocess
-import sys
+import os
+import secrets
+import shutil
+import socket
+import tempfile
+import threading
+import webbrowser
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from jaxmpc.errors import InputError, MissingToolError
+from jaxmpc.interrupts import in_the_end
+from studies.notebooks.guard import TOKEN, Guard
 
 APP = Path(__file__).with_name("explore.py")
+LOOPBACK = "127.0.0.1"
 
 
 def explore(port: int | None = None, headless: bool = False, store: str | Path | None = None) -> int:
-    """Serve the app on this machine until it is stopped.
+    """Serve the app on this machine until it is stopped; its address is printed.
 
     Args:
         port: of the page; a free one if not given.
@@ -21,10 +36,10 @@ def explore(port: int | None = None, headless: bool = False, store: str | Path |
         store: study store that the second page opens.
 
     Returns:
-        The exit status of the server.
+        1 where the server has ended by itself.
 
     Raises:
-        InputError: for a port that does not exist or a store that is not there; before anything is started.
+        InputError: for a port that does not exist or is in use, or a store that is not there; before anything is served.
         MissingToolError: if marimo is not installed.
     """
     if port is not None and not 1 <= port <= 65535:
@@ -34,13 +49,70 @@ def explore(port: int | None = None, headless: bool = False, store: str | Path |
     for tool in ("marimo", "altair"):
         if importlib.util.find_spec(tool) is None:
             raise MissingToolError(f"The app needs {tool}: pip install 'jaxmpc[notebook]'")
-    return subprocess.call(command(port, headless, store))
+    with _listen(port) as listening, _letter(headless) as letter:
+        token, own_port = secrets.token_urlsafe(32), listening.getsockname()[1]
+        address = f"http://{LOOPBACK}:{own_port}/?{TOKEN}={token}"
+        meta = {"store": "" if store is None else str(Path(store).resolve())}
+        serving = _serve(Guard(_app(), own_port, token, meta, entered=letter.close), listening)
+        print(f"jaxmpc: {address}", flush=True)
+        letter.send(address)
+        serving.join()
+    return 1
 
 
-def command(port: int | None, headless: bool, store: str | Path | None) -> list[str]:
-    """The command that serves the app; arguments of `explore`."""
-    words = [sys.executable, "-m", "marimo", "--quiet" if headless else "--yes", "run", str(APP)]
-    words += ["--no-sandbox", "--no-token"]
-    words += ["--port", str(port)] if port is not None else []
-    words += ["--headless"] if headless else []
-    return words + (["--", "--store", str(Path(store).resolve())] if store is not None else [])
+def _listen(port: int | None) -> socket.socket:
+    try:
+        return socket.create_server((LOOPBACK, port or 0))
+    except OSError as error:
+        raise InputError("port", port, f"one that is free ({error.strerror})") from None
+
+
+def _app() -> Any:
+    """The ASGI application of the notebook; who may use it is left to the guard."""
+    import marimo
+
+    return marimo.create_asgi_app(quiet=True).with_app(path="", root=str(APP)).build()
+
+
+def _serve(app: Guard, listening: socket.socket) -> threading.Thread:
+    """Answer in a thread; Ctrl-C is left to the main thread."""
+    import uvicorn
+
+    config = uvicorn.Config(
+        app, log_level="critical", timeout_keep_alive=300, ws_ping_interval=1, ws_ping_timeout=60
+    )
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
+    thread.start()
+    return thread
+
+
+class _Letter:
+    """Hands the address to the browser in a file of this user, as others can read the arguments of a program."""
+
+    def __init__(self, folder: Path | None):
+        self.folder = folder
+
+    def send(self, address: str) -> None:
+        """Open the page; it leads to the address."""
+        if self.folder is None:
+            return
+        page = self.folder / "open.html"
+        page.write_text(f'<meta http-equiv="refresh" content="0; url={html.escape(address)}">')
+        # A browser that is searched for may keep its caller waiting.
+        threading.Thread(target=webbrowser.open, args=(page.as_uri(),), daemon=True).start()
+
+    def close(self) -> None:
+        """Remove it, once it was read."""
+        if self.folder is not None:
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _letter(headless: bool) -> Iterator[_Letter]:
+    """In the home folder if possible: browsers in a sandbox of their own do not see temporary folders."""
+    home = os.path.expanduser("~")
+    place = home if os.access(home, os.W_OK) else None
+    letter = _Letter(None if headless else Path(tempfile.mkdtemp(prefix="jaxmpc-explore-", dir=place)))
+    with in_the_end(letter.close):
+        yield letter

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 
 from jaxmpc.errors import InputError, MissingToolError
+from jaxmpc.interrupts import last_words
 from jaxmpc.step_response import StepResponseModel
 from studies.sweep.chunk import run_scenarios, stored_times
 from studies.sweep.layout import FLAG
