@@ -148,7 +148,7 @@ def test_the_command_line_imports_nothing_heavy_before_a_command_asks_for_it():
         "sys",
     }
     light |= {"typing"}
-    own = ("jaxmpc.errors.", "jaxmpc.files.", "jaxmpc.options.")
+    own = ("jaxmpc.errors.", "jaxmpc.files.", "jaxmpc.interrupts", "jaxmpc.options.")
     for path in (ROOT / COMPOSITION_ROOT, ROOT / "jaxmpc/options.py"):
         for name, on_import in imports(path):
             assert not on_import or name.split(".")[0] in light or name.startswith(own), name
