@@ -137,7 +137,8 @@ def _compiled(contents: dict[str, str]) -> bytes:
             "from fmpy.build import build_platform_binary as build; "
             f"build({str(tree)!r}, {str(build)!r}, cmake_options={_cmake_options()!r})"
         )
-        status, said = run_program([sys.executable, "-P", "-c", code], environment)
+        command = [sys.executable, "-P", "-c", code]
+        status, said = run_program(command, {**environment, "TMPDIR": str(build)})
         if status != 0:
             raise MissingToolError(
                 "Building the FMU failed. A C compiler with its headers is needed (Debian or Ubuntu: "
