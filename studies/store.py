@@ -15,12 +15,14 @@ import json
 import os
 import shutil
 import tempfile
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
+import zarr
 
 from jaxmpc.errors import InputError
 from jaxmpc.trajectory import Trajectory
@@ -290,6 +292,16 @@ class ResultStore:
                     say(f"{name_of} cannot be read, nothing is taken over from it ({error}).")
 
 
+def consolidate(store: str | Path) -> None:
+    """Repeat the metadata of all arrays in that of the root, where `xarray.open_zarr` looks for them.
+
+    They are written once, before the first result, and no result changes them.
+    """
+    with warnings.catch_warnings():  # that other readers may not know of it, which then read the arrays' own
+        warnings.filterwarnings("ignore", "Consolidated metadata", UserWarning)
+        zarr.consolidate_metadata(str(store), zarr_format=3)
+
+
 def open_results(path: str | Path) -> xr.Dataset:
     """Open the results of a study, read lazily.
 
@@ -406,6 +418,7 @@ def _write_new(path: Path, template: xr.Dataset) -> None:
     temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=_UNFINISHED))
     try:
         template.to_zarr(temporary / RESULTS, zarr_format=3, consolidated=False, encoding=encoding)
+        consolidate(temporary / RESULTS)
         _write_record(temporary / RESULTS, FIXED)
         os.rename(temporary / RESULTS, path)
     finally:

@@ -42,6 +42,16 @@ def test_what_is_written_is_read_back_with_names_and_units(tmp_path):
     assert store.provenance(data, "versions")["python"]
 
 
+def test_xarray_opens_the_store_without_a_warning_before_during_and_after_a_run(tmp_path):
+    results = begin(tmp_path)
+    for finished in range(len(NAMES) + 1):
+        with xr.open_zarr(results.path, chunks=None) as data:  # a warning is an error here
+            xr.testing.assert_identical(data.load(), xr.open_zarr(results.path, consolidated=False).load())
+            assert data.complete.values.tolist() == [1] * finished + [0] * (len(NAMES) - finished)
+        if finished < len(NAMES):
+            results.write(NAMES[finished], made.trajectory("hunting"), 1.0)
+
+
 def test_a_run_that_is_not_there_reads_as_empty_and_incomplete(tmp_path):
     begin(tmp_path).write("step-choke", made.trajectory("hunting"), 1.0)
     run = open_results(tmp_path).sel(controller="mixed-integer")

@@ -172,6 +172,18 @@ def test_the_store_is_plain_zarr_with_one_zarr_chunk_per_study_chunk(tmp_path):
     assert names == [*(f"c.{i}.0.0" for i in range(3)), "zarr.json"]
 
 
+def test_xarray_opens_the_store_without_a_warning_before_during_and_after_a_run(tmp_path):
+    study, path = layout(), tmp_path / "study.zarr"
+    for chunks in range(len(study.chunk_scenarios) + 1):
+        run(path, study, chunks=range(chunks))
+        with xr.open_zarr(path, chunks=None) as plain:  # a warning is an error here
+            xr.testing.assert_identical(plain.load(), xr.open_zarr(path, consolidated=False).load())
+            rows = plain.isel(slot=plain.scenario.values >= 0)
+            ours = content(path).sel(scenario=rows.scenario.values)
+            np.testing.assert_array_equal(rows.position, ours.position)
+            np.testing.assert_array_equal(rows.kind.astype(object), ours.kind)
+
+
 def test_scenarios_that_are_not_there_read_as_empty_and_incomplete(tmp_path):
     study = layout()
     run(tmp_path, study, chunks=[1])

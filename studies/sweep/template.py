@@ -17,6 +17,7 @@ import zarr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.storage import MemoryStore
 
+from studies.store import consolidate
 from studies.sweep.layout import StoreLayout, Variable
 from studies.sweep.records import COMMITS, FORMAT, MANIFEST, chunk_file, mark, write_checked
 
@@ -99,6 +100,7 @@ def write_template(folder: Path, layout: StoreLayout) -> None:
         fixed(name, _plain(values), name.removesuffix("_unit"), unit, long_name)
     for variable in layout.variables:
         root.create_array(variable.name, **_variable_options(layout, variable, slots))
+    consolidate(folder)
 
     files = {}
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
