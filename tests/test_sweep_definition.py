@@ -424,8 +424,31 @@ def test_what_else_needs_a_compilation_of_its_own_parts_groups():
     assert [group.whole_steps for group in made.groups] == [0]
 
 
+@pytest.mark.parametrize("name", [name for name in shipped_studies() if name != "tune"])
+@pytest.mark.parametrize("quick", [True, False])
+def test_every_shipped_study_has_work_for_several_workers_and_loses_little_when_it_is_killed(name, quick):
+    made = load_study(name, quick=quick)
+    assert len(made.chunks) >= 8
+    assert max(len(chunk.scenarios) for chunk in made.chunks) <= made.count / 8
+
+
+def test_chunks_follow_from_the_number_of_scenarios_unless_their_size_is_given():
+    values = {count: axis(WEIGHT, *range(1, count + 1)) for count in (1, 7, 16, 31, 32, 600)}
+    sizes = {count: expand(axes=[entries]).chunk_size for count, entries in values.items()}
+    assert sizes == {1: 1, 7: 1, 16: 2, 31: 2, 32: 4, 600: 64}
+    assert expand(axes=[values[16]], study={"chunk_size": 50}).chunk_size == 16
+
+
+def test_a_study_that_grows_a_little_keeps_its_chunks():
+    grown = [expand(axes=[axis(WEIGHT, *range(1, count + 1))]) for count in (16, 20)]
+    few, more = ([study.scenario_hashes[k] for k in c.scenarios] for study in grown for c in study.chunks[:1])
+    assert few == more
+    assert [c.scenarios.tolist() for c in grown[1].chunks[:8]] == [c.scenarios.tolist() for c in grown[0].chunks]
+
+
 def test_no_chunk_is_larger_than_the_largest_group():
-    assert expand(axes=[axis("blocking", "moves", "inputs"), axis(WEIGHT, 1, 2, 3)]).chunk_size == 3
+    axes = [axis("blocking", "moves", "inputs"), axis(WEIGHT, 1, 2, 3)]
+    assert expand(axes=axes, study={"chunk_size": 50}).chunk_size == 3
 
 
 def test_a_scenario_number_outside_the_study_is_refused():
@@ -451,7 +474,7 @@ def test_a_study_survives_pickling():
 
 def test_the_quick_cut_replaces_what_it_names_and_nothing_else():
     quick = {
-        "chunk_size": 2,
+        "chunk_size": 3,
         "base": {"duration": 100},
         "axes": {WEIGHT: {"keep": [2, 0]}, "model.lift": {"count": 2}, "soft": {"values": [True]}},
     }
@@ -459,8 +482,8 @@ def test_the_quick_cut_replaces_what_it_names_and_nothing_else():
     axes = [axis(WEIGHT, 1, 2, 3), lift, axis("soft", True, False)]
     definition = define({"reference": "quick"}, axes, quick=quick)
     full, cut = definition.expand(), definition.expand(quick=True)
-    assert (full.name, full.count, full.scenario(0).samples, full.chunk_size) == ("made", 30, 1200, 30)
-    assert (cut.name, cut.count, cut.scenario(0).samples, cut.chunk_size) == ("made-quick", 4, 10, 2)
+    assert (full.name, full.count, full.scenario(0).samples, full.chunk_size) == ("made", 30, 1200, 2)
+    assert (cut.name, cut.count, cut.scenario(0).samples, cut.chunk_size) == ("made-quick", 4, 10, 3)
     assert cut.columns[0].values.tolist() == [3, 3, 1, 1]
     assert cut.columns[1].values.tolist() == [5000, 9000, 5000, 9000]
     with pytest.raises(InputError, match="no quick version"):

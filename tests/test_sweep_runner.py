@@ -289,6 +289,15 @@ def test_a_full_disk_ends_the_run_with_what_to_do_and_keeps_what_is_stored(
     same(run(study, tmp_path / "x.zarr"), serial)
 
 
+def test_how_a_study_is_cut_changes_its_results_by_rounding_only(study, serial, tmp_path):
+    alone = expand(study={"name": "tiny"})
+    assert (alone.chunk_size, study.chunk_size) == (1, 3)
+    with open_study(run(alone, tmp_path / "x.zarr", workers=2)) as data, open_study(serial) as wanted:
+        for name in set(wanted.data_vars) - set(CLOCK):
+            np.testing.assert_allclose(data[name], wanted[name], rtol=1e-9, atol=1e-9, err_msg=str(name))
+    assert len(chunk_facts(tmp_path / "x.zarr")) == 8
+
+
 def test_one_more_value_on_an_axis_computes_new_chunks_only(study, serial, hazard, tmp_path):
     path = tmp_path / "x.zarr"
     sections = dict(BODY, study={"name": "tiny", "chunk_size": 3})

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from msgspec import UnsetType
 
 from jaxmpc import html
 from jaxmpc.errors import InputError
@@ -32,6 +33,7 @@ from studies.sweep.resolve import Inputs, Variant, resolve, row
 
 KEY_FIGURES = 64  # numbers of a scenario besides trajectories
 NUMBER_BYTES = 8
+CHUNKS = 8  # at least, of a study with that many scenarios
 COMPUTING = (
     "kpi",
     "kpi_setpoint",
@@ -169,7 +171,8 @@ class Study:
         columns: one coordinate per axis key, in the order of the axes.
         groups: in the order of their first scenarios.
         chunks: of the groups in turn, each of consecutive scenarios of one group.
-        chunk_size: lanes of every chunk: ``study.chunk_size``, or the largest group if that is smaller.
+        chunk_size: lanes of every chunk: ``study.chunk_size`` or `default_chunk_size`, or the largest group if that is
+            smaller.
     """
 
     definition: StudyDefinition
@@ -353,7 +356,9 @@ def expand(definition: StudyDefinition, *, confirmed: bool = False) -> Study:
     table = expand_axes(definition, confirmed=confirmed)
     inputs = resolve(definition, table)
     groups = _groups(inputs, len(table))
-    size = min(definition.study.chunk_size, max(len(group.scenarios) for group in groups))
+    given = definition.study.chunk_size
+    wanted = default_chunk_size(len(table)) if isinstance(given, UnsetType) else given
+    size = min(wanted, max(len(group.scenarios) for group in groups))
     chunks: list[Chunk] = []
     for g, group in enumerate(groups):
         for begin in range(0, len(group.scenarios), size):
@@ -362,6 +367,16 @@ def expand(definition: StudyDefinition, *, confirmed: bool = False) -> Study:
     for group in groups:  # the typed objects agree with the checks of whole columns
         study.scenario(int(group.scenarios[0]))
     return study
+
+
+def default_chunk_size(scenarios: int) -> int:
+    """Scenarios of a chunk where the definition does not say: a power of two that makes `CHUNKS` chunks or more, at most 64.
+
+    So several workers have something to do, and a run that is killed loses little. It follows from the study and not from
+    the workers, who may change from one start to the next; as a power of two it stays when a study grows a little, and with
+    it the chunks and the compiled programs.
+    """
+    return 2 ** min(max(scenarios // CHUNKS, 1).bit_length() - 1, 6)
 
 
 def load_study(name_or_path: str | Path, *, quick: bool = False, confirmed: bool = False) -> Any:

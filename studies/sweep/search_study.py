@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import UnsetType
 
 from jaxmpc.errors import InputError
 from studies import fingerprint
@@ -38,6 +39,7 @@ from studies.sweep.sections import Search
 
 SEEKING = ("sweep.search", "sweep.objectives")  # modules of `studies` that decide which points are asked for
 LIBRARY = "optuna"
+BATCH = 64  # scenarios, where the definition does not say
 
 
 class SearchDescription(Description):
@@ -103,7 +105,7 @@ class SearchStudy:
     @property
     def chunk_size(self) -> int:
         """Scenarios of a batch."""
-        return self.definition.study.chunk_size
+        return _batch_size(self.definition)
 
     @property
     def count(self) -> int:
@@ -264,7 +266,7 @@ def expand_search(definition: StudyDefinition, *, confirmed: bool = False) -> Se
     if not definition.axes:
         raise InputError("axes", "nothing", "one axis or more to search along, each headed [[axes]]")
     parameters = tuple(parameter_of(definition, i) for i in range(len(definition.axes)))
-    count, limit = search.batches * definition.study.chunk_size, definition.study.confirmation_limit
+    count, limit = search.batches * _batch_size(definition), definition.study.confirmation_limit
     if count > limit and not confirmed:
         expected = f"at most {limit} scenarios without confirmation"
         hint = "Confirm the run, or ask for fewer batches"
@@ -273,6 +275,11 @@ def expand_search(definition: StudyDefinition, *, confirmed: bool = False) -> Se
     probe = listed(definition, parameters, points)
     check_one_group(probe, parameters, points)
     return SearchStudy(definition, parameters, objectives, probe)
+
+
+def _batch_size(definition: StudyDefinition) -> int:
+    given = definition.study.chunk_size
+    return BATCH if isinstance(given, UnsetType) else given
 
 
 def _plain(field: Field, values: np.ndarray) -> list[Any]:

@@ -27,13 +27,14 @@ class StudySection(Section, frozen=True):
     Attributes:
         name: of the study and of its folder of results.
         title: for reports.
-        chunk_size: scenarios that are computed and stored together.
+        chunk_size: scenarios that are computed and stored together; if not given, `scenarios.default_chunk_size` of a
+            study, `search_study.BATCH` of a search.
         confirmation_limit: scenarios beyond which a run must be confirmed.
     """
 
     name: str
     title: str = ""
-    chunk_size: Count = 64
+    chunk_size: Count | UnsetType = UNSET
     confirmation_limit: Count = 10_000
 
 
