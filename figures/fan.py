@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -180,8 +181,8 @@ def distributions(data: xr.Dataset, found: list[Variant]) -> Iterator[Figure]:
         grid[0, 0].set_ylabel(style.printed("share of the runs [%]"))
         legend = [Line2D([], [], color=v.colour, label=v.label) for v in found]
         command = ", ".join(f"#{number}" for number in dict.fromkeys(said))
-        name = shown_store(data)
-        words = f"Worst runs: {command}. One of them again: jaxmpc simulate {name}#{said[0] if said else 0}"
+        again = shlex.quote(f"{shown_store(data)}#{said[0] if said else 0}")
+        words = f"Worst runs: {command}. One of them again: jaxmpc simulate {again}"
         sheet.write(drawn, data, ["Share of the runs that stay at or below a value.", words], legend)
         yield drawn
 

@@ -15,6 +15,7 @@ import io
 import json
 import os
 import re
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -228,7 +229,7 @@ def _study_sweep(options: argparse.Namespace, given: dict[str, Any]) -> int:
     try:
         study = load_study(options.study, quick=options.quick, confirmed=dry or "yes" in given)
     except InputError as error:
-        raise InputError(error.field, error.value, error.expected, _hint(error, options.study)) from None
+        raise _refused(error, options.study) from None
     if dry:
         return _dry_run(study, options, given)
     from studies.sweep.runner import RunError, run_study
@@ -251,19 +252,23 @@ def _study_sweep(options: argparse.Namespace, given: dict[str, Any]) -> int:
     folder = path.with_name(f"{path.stem}-figures")
     draw_sweep(path, folder)
     print(f"Results: {path}, figures: {folder}")
-    print(f"Look at them with: jaxmpc study export {path} {path.stem}.csv")
+    print(f"Look at them with: jaxmpc study export {shlex.quote(str(path))} {shlex.quote(f'{path.stem}.csv')}")
     return EXIT_OPTIMAL
 
 
-def _hint(error: InputError, study: str) -> str:
-    """What to do about a definition that is refused."""
+def _refused(error: InputError, study: str) -> InputError:
+    """The error of a definition with what the command line can do about it."""
+    from studies.sweep.definition import shipped_studies
     from studies.sweep.fields import near
 
     if error.field == "study.confirmation_limit":
-        return "Give --yes to run them all, --dry-run to see how long that takes"
-    if error.field == "study" and not Path(study).exists():
-        return error.hint or near(study, COMPARISONS)
-    return error.hint
+        hint = "Give --yes to run them all, --dry-run to see how long that takes"
+        return InputError(error.field, error.value, error.expected, hint)
+    if error.field == "study" and not os.path.exists(study):
+        sweeps, comparisons = ", ".join(shipped_studies()), ", ".join(COMPARISONS)
+        expected = f"a comparison ({comparisons}), a sweep ({sweeps}), or a definition file that exists"
+        return InputError("study", study, expected, near(study, [*COMPARISONS, *shipped_studies()]))
+    return error
 
 
 def _dry_run(study: Any, options: argparse.Namespace, given: dict[str, Any]) -> int:
@@ -281,8 +286,6 @@ def _dry_run(study: Any, options: argparse.Namespace, given: dict[str, Any]) -> 
 
 def _command(study: str, quick: bool, confirmed: bool) -> str:
     """What follows ``jaxmpc study run`` to go on with a study, from any folder."""
-    import shlex
-
     from studies.sweep.definition import shipped_studies
 
     name = study if study in shipped_studies() else str(Path(study).resolve())

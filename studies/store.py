@@ -320,7 +320,7 @@ def open_results(path: str | Path) -> xr.Dataset:
     if not store.exists():
         raise InputError("results", str(path), f"a study folder with {RESULTS}", "Run the study first")
     try:
-        data = xr.open_zarr(store, consolidated=False, chunks=None)
+        data = xr.open_zarr(store, consolidated=False, chunks=None, zarr_format=3)
         # Plain strings select and print better than the stored type.
         plain = {
             n: (v.dims, v.values.astype(object), v.attrs)

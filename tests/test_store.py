@@ -236,6 +236,14 @@ def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
         store.check_writable(tmp_path / "results" / "thesis")
 
 
+def test_a_store_in_the_older_format_which_can_hold_pickles_is_not_read(tmp_path):
+    xr.Dataset({"complete": ("controller", [1])}, attrs={"format": store.FORMAT}).to_zarr(
+        tmp_path / store.RESULTS, zarr_format=2
+    )
+    with pytest.raises(InputError, match="readable store"):
+        open_results(tmp_path)
+
+
 def test_the_store_is_plain_zarr_with_json_metadata(tmp_path):
     begin(tmp_path)
     body = json.loads((tmp_path / store.RESULTS / "zarr.json").read_text())

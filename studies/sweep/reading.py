@@ -45,7 +45,7 @@ def open_study(path: str | Path) -> xr.Dataset:
         UserWarning: naming damaged files of chunks; their scenarios read as empty.
     """
     store, manifest = open_manifest(path)
-    root = zarr.open_group(str(store), mode="r")
+    root = zarr.open_group(str(store), mode="r", zarr_format=3)
     arrays: dict[str, Any] = {n: root[n] for key in ("columns", "coords", "variables") for n in manifest[key]}
     numbers = _fixed(root["scenario"])
     slots = np.flatnonzero(numbers >= 0)

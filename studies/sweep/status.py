@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,7 +38,7 @@ class StudyStatus:
         seconds_left: what one worker needs for the rest [s], every group by its own stored chunks (`estimate.Work`);
             NaN where the store does not say what the chunks are.
         running: whether a run writes the store right now.
-        definition: file that the study was run from, as far as its provenance says.
+        definition: what follows ``jaxmpc study run``, quoted for a shell, as far as the provenance says.
     """
 
     store: Path
@@ -79,7 +80,7 @@ class StudyStatus:
         if self.pace:
             lines.append(self.pace)
         lines += [f"Damaged: {name}" for name in self.damaged]
-        again = f"jaxmpc study run {self.definition} --store {self.store}"
+        again = f"jaxmpc study run {self.definition} --store {shlex.quote(str(self.store))}"
         if self.running:
             lines.append("A run is writing it now.")
         elif self.damaged:
@@ -102,7 +103,7 @@ def status(path: str | Path, verify: bool = False) -> StudyStatus:
         InputError: if there is no store or its fixed files are damaged.
     """
     store, manifest = open_manifest(path)
-    root = zarr.open_group(str(store), mode="r")
+    root = zarr.open_group(str(store), mode="r", zarr_format=3)
     found = survey(store, manifest["contents"], deep=verify)
     tables = read_small(store, found, {name: root[name] for name in manifest["variables"]})
     counts, size = manifest["chunk_counts"], manifest["chunk_size"]

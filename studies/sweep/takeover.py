@@ -84,5 +84,5 @@ class OlderStores:
 
     def _read(self, path: Path, chunk: int, name: str) -> np.ndarray:
         size = self._records[path, chunk]["chunk_size"]
-        array = zarr.open_array(str(path / name), mode="r")
+        array = zarr.open_array(str(path / name), mode="r", zarr_format=3)
         return np.asarray(array[chunk * size : (chunk + 1) * size])
