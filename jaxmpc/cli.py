@@ -252,7 +252,9 @@ def _study_sweep(options: argparse.Namespace, given: dict[str, Any]) -> int:
     folder = path.with_name(f"{path.stem}-figures")
     draw_sweep(path, folder)
     print(f"Results: {path}, figures: {folder}")
-    print(f"Look at them with: jaxmpc study export {shlex.quote(str(path))} {shlex.quote(f'{path.stem}.csv')}")
+    print(
+        f"Look at them with: jaxmpc study export {shlex.quote(str(path))} {shlex.quote(f'{path.stem}.csv')}"
+    )
     return EXIT_OPTIMAL
 
 

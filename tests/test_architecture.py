@@ -145,9 +145,9 @@ def test_the_command_line_imports_nothing_heavy_before_a_command_asks_for_it():
         "os",
         "pathlib",
         "re",
-        "sys",
+        "shlex",
     }
-    light |= {"typing"}
+    light |= {"sys", "typing"}
     own = ("jaxmpc.errors.", "jaxmpc.files.", "jaxmpc.interrupts", "jaxmpc.options.")
     for path in (ROOT / COMPOSITION_ROOT, ROOT / "jaxmpc/options.py"):
         for name, on_import in imports(path):

@@ -445,7 +445,7 @@ def test_distributions_are_sorted_and_name_the_worst_run_with_its_command(tmp_pa
             np.testing.assert_allclose(line.get_ydata()[[0, -1]], [0, 100])
             worst = 12 * j + int(np.argmax(travel))
             assert f"worst: #{worst}" in [text.get_text() for text in first.texts]
-        assert f"jaxmpc simulate {fan.shown_store(data)}#" in caption(drawn)
+        assert f"jaxmpc simulate '{fan.shown_store(data)}#" in caption(drawn)
         assert fan.shown_store(data).endswith("a.zarr")
         assert all("[" in ax.get_xlabel() for ax in drawn.axes)
 

@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from jaxmpc.cli import main
+from jaxmpc.options import COMPARISONS
 from studies.sweep import runner
 from studies.sweep.chunk import study_layout
 from studies.sweep.definition import shipped_studies
@@ -244,6 +246,8 @@ def test_more_scenarios_than_the_limit_need_a_confirmation(file, started, capsys
         (["deadzone", "--plant", "jax"], ["--plant", "thesis"]),
         (["deadzon"], ["deadzone", "blocking", "mismatch", "robustness"]),
         (["tesis"], ["Did you mean thesis?"]),
+        (["fine-regulaton"], ["Did you mean fine-regulation?"]),
+        (["nosuch"], [*COMPARISONS, *shipped_studies(), "a definition file"]),
         (["nosuch.toml"], ["nosuch.toml", "definition file"]),
     ],
 )
@@ -284,14 +288,23 @@ def test_status_gives_the_command_that_goes_on(quick, file, tmp_path, monkeypatc
         raise KeyboardInterrupt
 
     monkeypatch.setattr(runner, "prepare_study", stop)
-    words = ["tiny.toml", "--store", "x.zarr", *(["--quick"] if quick else [])]
+    words = ["tiny.toml", "--store", "my x.zarr", *(["--quick"] if quick else [])]
     assert main(["study", "run", *words]) == 130
     assert "Give the same command again" in capsys.readouterr().out
-    assert main(["study", "status", "x.zarr"]) == 0
+    assert main(["study", "status", "my x.zarr"]) == 0
     out = capsys.readouterr().out
     assert f"0 of {4 if quick else 8} scenarios (0%)" in out
     again = out.splitlines()[-1].strip()
-    assert again == f"jaxmpc study run '{file}'{' --quick' if quick else ''} --store x.zarr"
+    assert again == f"jaxmpc study run '{file}'{' --quick' if quick else ''} --store 'my x.zarr'"
+
+
+def test_suggested_commands_are_quoted_for_a_shell(file, tmp_path, no_figures, monkeypatch, capsys):
+    store = tmp_path / "it's $HOME; a store.zarr"
+    monkeypatch.setattr(runner, "run_study", lambda study, path, **options: path)
+    assert main(["study", "run", str(file), "--store", str(store)]) == 0
+    *_, last = capsys.readouterr().out.splitlines()
+    words = shlex.split(last.partition("with: ")[2])
+    assert words == ["jaxmpc", "study", "export", str(store), f"{store.stem}.csv"]
 
 
 def test_status_of_a_shipped_study_names_it(tmp_path, monkeypatch, no_figures, capsys):

@@ -443,7 +443,9 @@ def test_a_study_that_grows_a_little_keeps_its_chunks():
     grown = [expand(axes=[axis(WEIGHT, *range(1, count + 1))]) for count in (16, 20)]
     few, more = ([study.scenario_hashes[k] for k in c.scenarios] for study in grown for c in study.chunks[:1])
     assert few == more
-    assert [c.scenarios.tolist() for c in grown[1].chunks[:8]] == [c.scenarios.tolist() for c in grown[0].chunks]
+    assert [c.scenarios.tolist() for c in grown[1].chunks[:8]] == [
+        c.scenarios.tolist() for c in grown[0].chunks
+    ]
 
 
 def test_no_chunk_is_larger_than_the_largest_group():

@@ -25,6 +25,7 @@ from studies.sweep.tables import read_columns, read_rows
 
 SOURCES = ("values", "range", "distribution", "csv")
 SAMPLED = ("latin-hypercube", "sobol")
+MOST = 1_000_000  # scenarios of a study, and values of a range, also of one that is confirmed
 EDGE = 1e-12  # a draw of exactly 0 or 1 would be infinitely far out in a normal distribution
 
 
@@ -142,7 +143,7 @@ def expand_axes(definition: StudyDefinition, *, confirmed: bool = False) -> Axis
             if i not in drawn
         }
         draws = int(sampling.count) if sampled else 0  # type: ignore[arg-type]
-        _confirm(definition, _total(method, [len(axis) for axis in listed.values()], draws), confirmed)
+        check_count(definition, _total(method, [len(axis) for axis in listed.values()], draws), confirmed)
         points = unit_points(method, len(drawn), draws, sampling.seed) if sampled else np.zeros((0, 0))
         axes = [
             listed[i]
@@ -150,7 +151,7 @@ def expand_axes(definition: StudyDefinition, *, confirmed: bool = False) -> Axis
             else _drawn_axis(definition.axes[i], definition.places[i], *heads[i], points[:, drawn.index(i)])
             for i in range(len(heads))
         ]
-    _confirm(definition, len(axes[0]) if method == "list" else 0, confirmed)
+    check_count(definition, len(axes[0]) if method == "list" else 0, confirmed)
     return AxisTable(tuple(axes), _combine(method, axes))
 
 
@@ -169,11 +170,12 @@ def unit_points(method: str, dimensions: int, count: int, seed: int) -> np.ndarr
 def draw(distribution: Distribution, points: np.ndarray) -> np.ndarray:
     """Values of a distribution at points of the unit interval, by its inverse distribution function."""
     d: Any = distribution
-    if distribution.kind == "normal":
-        return d.mean + d.deviation * ndtri(np.clip(points, EDGE, 1 - EDGE))
-    if distribution.kind == "log-uniform":
-        return d.from_ * (d.to / d.from_) ** points
-    return d.from_ + (d.to - d.from_) * points
+    with np.errstate(over="ignore", invalid="ignore"):  # the values are checked afterwards
+        if distribution.kind == "normal":
+            return d.mean + d.deviation * ndtri(np.clip(points, EDGE, 1 - EDGE))
+        if distribution.kind == "log-uniform":
+            return d.from_ * np.float64(d.to / d.from_) ** points
+        return d.from_ + (d.to - d.from_) * points
 
 
 def _total(method: str, lengths: list[int], draws: int) -> int:
@@ -182,8 +184,11 @@ def _total(method: str, lengths: list[int], draws: int) -> int:
     return math.prod(lengths) * (draws or 1)
 
 
-def _confirm(definition: StudyDefinition, count: int, confirmed: bool) -> None:
+def check_count(definition: StudyDefinition, count: int, confirmed: bool) -> None:
+    """Refuse more scenarios than a study may have, or than were confirmed."""
     limit = definition.study.confirmation_limit
+    if count > MOST:
+        raise InputError("study", f"{count} scenarios", f"at most {MOST} scenarios", "Make the axes shorter")
     if count > limit and not confirmed:
         raise InputError(
             "study.confirmation_limit",
@@ -291,11 +296,13 @@ def _listed_axis(axis: Axis, place: str, fields, labels, folder: str) -> Entries
         )
     if axis.keep is not UNSET:
         keep: Any = axis.keep
+        seen = set[int]()
         for n, j in enumerate(keep):
-            if not 0 <= j < len(values[0]) or j in keep[:n]:
+            if not 0 <= j < len(values[0]) or j in seen:
                 raise InputError(
                     f"{place}.keep[{n}]", j, f"positions from 0 to {len(values[0]) - 1}, each once"
                 )
+            seen.add(j)
         if not keep:
             raise InputError(f"{place}.keep", keep, "one position or more")
         values = tuple([column[j] for j in keep] for column in values)
@@ -305,6 +312,8 @@ def _listed_axis(axis: Axis, place: str, fields, labels, folder: str) -> Entries
 
 def spaced(given: Range, path: str) -> list[float]:
     """The values of a range, ends included, rounded to 12 digits so that 0.1 steps read 0.3 and not 0.30000000000000004."""
+    if given.count > MOST:
+        raise InputError(f"{path}.count", given.count, f"at most {MOST} values")
     low, high = given.from_, given.to
     for name, value in (("from", low), ("to", high)):
         if not math.isfinite(value) or (given.scale == "log" and value <= 0):
@@ -317,7 +326,8 @@ def spaced(given: Range, path: str) -> list[float]:
     if given.count > 1 and low == high:
         raise InputError(f"{path}.to", high, f"another value than from = {low:g} for {given.count} values")
     space = np.geomspace if given.scale == "log" else np.linspace
-    return [float(f"{value:.12g}") for value in space(low, high, given.count)]
+    with np.errstate(over="ignore", invalid="ignore"):  # the values are checked afterwards
+        return [float(f"{value:.12g}") for value in space(low, high, given.count)]
 
 
 def _drawn_axis(axis: Axis, place: str, fields, labels, points: np.ndarray) -> Entries:

@@ -83,6 +83,7 @@ class StudyDefinition:
         sections = ("study", "base", "axes", "sampling", "search", "store", "quick")
         if not isinstance(body, dict):
             raise InputError("study definition", body, f"tables {', '.join(sections)}")
+        _check_plain(body)
         for name in body:
             if name not in sections:
                 raise InputError(
@@ -92,8 +93,8 @@ class StudyDefinition:
         if not isinstance(axes, list):
             raise InputError("axes", axes, "a list of tables, each headed [[axes]]")
         study = _convert(body.get("study", {}), StudySection, "study")
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", study.name):
-            expected = "letters, digits, '-', '_' and '.' only: it names the folder of the results"
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", study.name):
+            expected = "up to 100 letters, digits, '-', '_' and '.': it names the folder of the results"
             raise InputError("study.name", study.name, expected)
         quick = _convert(body["quick"], Quick, "quick") if "quick" in body else None
         search = _convert(body["search"], Search, "search") if "search" in body else None
@@ -111,6 +112,9 @@ class StudyDefinition:
             body=body,
             search=search,
         )
+        for i, name in enumerate(out.store.trajectories):
+            if name in out.store.trajectories[:i]:
+                raise InputError(f"store.trajectories[{i}]", name, "each trajectory once")
         if quick is not None:
             out.cut()  # so that a mistake in it is found by every run
         return out
@@ -219,6 +223,34 @@ def shipped_studies() -> dict[str, Path]:
 
 # ------------------------------------------------------------------------------------------------------- decoding
 
+DEEPEST = 16  # tables and lists within each other; no key needs more than five
+LARGEST_WHOLE = 2**63 - 1  # as TOML has them
+
+
+def _check_plain(body: dict[str, Any]) -> None:
+    """Refuse what no TOML file holds, or no study needs, before anything looks closer: it could not even be printed."""
+    level: list[tuple[str, Any]] = [("", body)]
+    for _ in range(DEEPEST):
+        inner: list[tuple[str, Any]] = []
+        for path, value in level:
+            if isinstance(value, dict):
+                for key in value:
+                    if not isinstance(key, str) or not key.isprintable():
+                        raise InputError(path or "study definition", key, "keys of printable text")
+                inner += [(f"{path}.{key}".lstrip("."), entry) for key, entry in value.items()]
+            elif isinstance(value, (list, tuple)):
+                inner += [(f"{path}[{i}]", entry) for i, entry in enumerate(value)]
+            elif isinstance(value, str):
+                try:
+                    value.encode()
+                except UnicodeEncodeError:
+                    raise InputError(path, value, "text of whole Unicode characters") from None
+            elif isinstance(value, int) and abs(value) > LARGEST_WHOLE:
+                raise InputError(path, f"{value.bit_length()} bits", "a whole number of at most 63 bits")
+        level = inner
+    if level:
+        raise InputError(level[0][0], "tables or lists", f"no more than {DEEPEST} of them within each other")
+
 
 def settings(body: Any, path: str) -> dict[str, Any]:
     """A base table as settings by key, each of its own type; `InputError` with the full path otherwise."""
@@ -311,7 +343,13 @@ _EXPECTED = {
     "setpoints": f"a list of rows, one number per CV ({', '.join(CV_NAMES)}) [m3/h]",
     "duration": "a length of the run [s]",
 }
-_KIND = {"float": "a finite number", "int": "a whole number", "str": "text in quotes", "object": "a table"}
+_KIND = {
+    "float": "a finite number",
+    "int": "a whole number",
+    "str": "text in quotes",
+    "object": "a table",
+    "array": "a list",
+}
 
 
 def _convert(body: Any, section: type[T], path: str) -> T:

@@ -19,6 +19,7 @@ from jaxmpc.tuning import CV_FIELDS, LIMITS, MV_FIELDS, UNITS
 from jaxmpc.well import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS, WellParameters
 from studies import presets, references
 
+LONGEST = 10_000  # samples of a horizon; more would not fit into memory
 Kind = Literal["number", "whole", "flag", "text", "lengths"]
 
 
@@ -62,7 +63,7 @@ class Field:
         if self.kind == "text":
             return "one of " + ", ".join(self.choices)
         if self.kind == "lengths":
-            return "lengths of blocks in whole samples, 1 or more, such as [1, 1, 2, 4]"
+            return f"lengths of blocks in whole samples, 1 or more and {LONGEST} together at most, such as [1, 1, 2, 4]"
         words = (
             "a whole number" if self.kind == "whole" else "a number" if self.infinite else "a finite number"
         )
@@ -88,10 +89,16 @@ class Field:
             return value
         if self.kind == "lengths":
             whole = isinstance(value, (list, tuple)) and all(type(v) is int and v >= 1 for v in value)
-            if not whole or not len(value):
+            if not whole or not 1 <= sum(value) <= LONGEST:
                 raise InputError(path, value, expected)
             return tuple(value)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise InputError(path, value, expected)
+        if (
+            isinstance(value, int) and value.bit_length() > 63
+        ):  # of a CSV file, too large for a float or to be printed
+            raise InputError(path, f"{value.bit_length()} bits", expected)
+        if math.isnan(value):
             raise InputError(path, value, expected)
         if math.isinf(value) and not self.infinite:
             raise InputError(path, value, expected)
@@ -216,7 +223,7 @@ def _unit(field: str, unit: str) -> str:
 
 
 def _table() -> dict[str, Field]:
-    samples: dict[str, Any] = dict(kind="whole", low=1, shape=True)
+    samples: dict[str, Any] = dict(kind="whole", low=1, high=LONGEST, shape=True)
     first = presets.structure()
     out = [
         Field("controller", "controller", "", "text", "mixed-integer", ("continuous", "mixed-integer"), True),

@@ -29,6 +29,7 @@ from studies.sweep.sections import InlineReference
 
 NAMES = {**dict.fromkeys(CV_FIELDS, CV_NAMES), **dict.fromkeys(MV_FIELDS, MV_NAMES)}
 SHAPE_KEYS = tuple(field.key for field in FIELDS.values() if field.shape)
+LONGEST_RUN = 1_000_000  # samples
 LISTED = (
     200  # entries of an axis up to which each is checked by itself, instead of the smallest and the largest
 )
@@ -180,6 +181,9 @@ def _variants(settings: Settings) -> tuple[tuple[Variant, ...], np.ndarray]:
             raise InputError(
                 settings.table.blame(["duration"], k), wanted[1], f"one sample of {structure.dt:g} s or more"
             )
+        if samples > LONGEST_RUN:
+            path = settings.table.blame(["duration" if wanted[1] is not None else "reference"], k)
+            raise InputError(path, f"{samples} samples", f"a run of at most {LONGEST_RUN} samples")
         variants.append(Variant(value("controller"), value("actuator"), structure, reference, samples))
     return tuple(variants), index
 

@@ -19,6 +19,7 @@ from msgspec import UnsetType
 
 from jaxmpc.errors import InputError
 from studies import fingerprint
+from studies.sweep.axes import check_count
 from studies.sweep.chunk import study_layout
 from studies.sweep.definition import StudyDefinition
 from studies.sweep.estimate import MODEL_SECONDS, Work, chunk_seconds
@@ -266,11 +267,7 @@ def expand_search(definition: StudyDefinition, *, confirmed: bool = False) -> Se
     if not definition.axes:
         raise InputError("axes", "nothing", "one axis or more to search along, each headed [[axes]]")
     parameters = tuple(parameter_of(definition, i) for i in range(len(definition.axes)))
-    count, limit = search.batches * _batch_size(definition), definition.study.confirmation_limit
-    if count > limit and not confirmed:
-        expected = f"at most {limit} scenarios without confirmation"
-        hint = "Confirm the run, or ask for fewer batches"
-        raise InputError("study.confirmation_limit", f"{count} scenarios", expected, hint)
+    check_count(definition, search.batches * _batch_size(definition), confirmed)
     points = extremes_of(parameters)
     probe = listed(definition, parameters, points)
     check_one_group(probe, parameters, points)
