@@ -499,7 +499,7 @@ def test_a_dry_run_counts_scenarios_compilations_models_and_bytes():
     description = made.describe()
     assert description.scenarios == 6
     assert description.group_sizes == (3, 3)
-    assert (description.chunks, description.compilations, description.models) == (2, 2, 3)
+    assert (description.chunks, description.compilations, description.models) == (6, 2, 3)
     assert description.samples == 600
     assert description.stored_bytes == 6 * 8 * (64 + 10 * 3)
     assert description.seconds == pytest.approx(3 * MODEL_SECONDS + made.work.rest({}))
