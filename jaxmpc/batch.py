@@ -18,7 +18,7 @@ import numpy as np
 from jax.extend.core import Literal
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from jaxmpc.controller import ContinuousController
+from jaxmpc.controller import ContinuousController, may_switch
 from jaxmpc.errors import InputError
 from jaxmpc.step_response import StepResponseModel
 from jaxmpc.structure import Structure
@@ -122,13 +122,14 @@ def controller_batch(
         raise InputError(
             "tunings", f"lane counts {sorted(counts)}", "tunings or models with one lane axis, of one length"
         )
-    summed = (not own_model) if summed is None else summed
+    summed, switching = (not own_model) if summed is None else summed, may_switch(stacked)
     each = (stacked if tuned else None, coefficients if own_model else None)
 
     def build(given: tuple[Tuning | None, Any]) -> ContinuousController:
         tuning, own = given
         fitted = eqx.tree_at(lambda m: m.coefficients, one_model, coefficients if own is None else own)
-        return ContinuousController(structure, stacked if tuning is None else tuning, fitted, summed=summed)
+        known = dict(summed=summed, switching=switching)
+        return ContinuousController(structure, stacked if tuning is None else tuning, fitted, **known)
 
     return build_lanes(build, each, counts.pop())
 

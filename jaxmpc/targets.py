@@ -28,7 +28,7 @@ from jaxmpc.reference import Reference
 from jaxmpc.sample import checked, checked_start
 from jaxmpc.step_response import StepResponseModel, check_match
 from jaxmpc.structure import Structure
-from jaxmpc.trajectory import Trajectory
+from jaxmpc.trajectory import AXES, Trajectory
 from jaxmpc.tuning import CV_FIELDS, DEFAULTS, Tuning
 
 SUFFIX = ".target"
@@ -194,6 +194,8 @@ def simulate_with_targets(
     mv_target: Reference,
     *,
     noise=None,
+    faults=None,
+    position_feedback: bool = False,
     **options: Any,
 ) -> Trajectory:
     """Close the loop with setpoints for the CVs and targets for the MVs.
@@ -204,6 +206,7 @@ def simulate_with_targets(
         reference: setpoints, one column per CV.
         mv_target: targets over time, one column per MV; columns of MVs without a target are not looked at.
         noise: standard deviation of the measurement noise, ``"cv"`` [CV unit]; demands are known without noise.
+        faults, position_feedback: as in `jaxmpc.simulate`, for the plant's own CVs.
         **options: of `jaxmpc.simulate`.
 
     Returns:
@@ -225,10 +228,17 @@ def simulate_with_targets(
                 "noise", np.asarray(noise).tolist(), f"{own.cv_count} standard deviations, one per CV"
             )
         noise = np.append(given, np.zeros(len(targeted)))
+    if faults is not None:
+        faults = np.asarray(faults, dtype=np.float64)
+        if faults.ndim != 2 or faults.shape[1] != own.cv_count:
+            raise InputError("faults", f"shape {list(faults.shape)}", f"[sample, {own.cv_count}] errors")
+        faults = np.pad(faults, ((0, 0), (0, len(targeted))))
     both = _joined(reference, mv_target, own.dt, targeted)
-    wide = simulate(controller.controller, _Reporting(plant, targeted), both, noise=noise, **options)
+    reporting = _Reporting(plant, targeted, position_feedback)
+    given = dict(noise=noise, faults=faults, position_feedback=position_feedback)
+    wide = simulate(controller.controller, reporting, both, **given, **options)
     count = own.cv_count
-    fields = {key: getattr(wide, key)[:, :count] for key in ("setpoint", "cv", "bias", "bias_raw")}
+    fields = {key: getattr(wide, key)[:, :count] for key in AXES["cv"]}
     return dataclasses.replace(wide, **fields, cv_names=own.cv_names, cv_units=own.cv_units)
 
 
@@ -249,11 +259,11 @@ class _Outputs(NamedTuple):
 
 
 class _Reporting:
-    """A plant on the host that also measures the demands of the MVs with a target."""
+    """A plant on the host that also measures the MVs with a target: their demands, or their positions if these are told."""
 
-    def __init__(self, plant: Any, targeted: tuple[int, ...]):
+    def __init__(self, plant: Any, targeted: tuple[int, ...], told: bool):
         self.plant = HostWell(plant) if isinstance(plant, WellPlant) else plant
-        self.targeted, self.dt = list(targeted), plant.dt
+        self.targeted, self.told, self.dt = list(targeted), told, plant.dt
 
     def init(self) -> _Outputs:
         outputs = self.plant.init()
@@ -263,5 +273,5 @@ class _Reporting:
         return self._report(self.plant.step(mv, disturbance), mv)
 
     def _report(self, outputs, demand) -> _Outputs:
-        known = np.asarray(demand)[self.targeted]
+        known = np.asarray(outputs.mv if self.told else demand)[self.targeted]
         return _Outputs(np.append(np.asarray(outputs.cv), known), np.asarray(outputs.mv))

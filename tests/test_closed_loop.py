@@ -327,7 +327,10 @@ def test_faults_of_sensors_and_told_positions_are_the_same_in_compiled_loops_and
     compiled = simulate(controller, plant, TO_30_PERCENT, **given)
     stepped = simulate(controller, OnTheHost(plant), TO_30_PERCENT, **given)
     lanes = controller_batch(structure, [controller.tuning] * 2, model)
-    both = {key: np.stack([0 * value, value]) if key == "faults" else value for key, value in given.items()}
+    both = {
+        key: np.stack([np.zeros_like(value), value]) if key == "faults" else value
+        for key, value in given.items()
+    }
     feedback = {"position_feedback": np.array([False, True]), "seed": np.array([0, 0])}
     sound, failing = simulate_batch(lanes, plant, TO_30_PERCENT, **(both | feedback))
     for run in (stepped, failing):
