@@ -6,13 +6,13 @@ process starts without compiling; set ``JAX_COMPILATION_CACHE_DIR`` to move it o
 to leave it off. The public names of its modules can be taken from the package itself.
 """
 
-import os as _os
-from importlib import import_module as _import_module
-
 from jaxmpc import interrupts as _interrupts
 
-if _interrupts.is_command():  # before JAX, whose import takes a while
+if _interrupts.is_command():  # before everything else, as JAX takes a while
     _interrupts.install()
+
+import os as _os
+from importlib import import_module as _import_module
 
 import jax as _jax
 

@@ -7,16 +7,34 @@ are freed. Where the process is the command, `jaxmpc` installs this before it im
 `front_door`. For a library nothing changes: Ctrl-C raises `KeyboardInterrupt`.
 """
 
+# ruff: noqa: E402, Ctrl-C waits before most is imported
+
 from __future__ import annotations
+
+import os
+import signal
+import sys
+
+
+def is_command() -> bool:
+    """Whether this process is ``jaxmpc`` or ``python -m jaxmpc.cli``, and not a worker that it has spawned."""
+    program = sys.argv[0] if getattr(sys, "argv", None) else ""
+    if "--multiprocessing-fork" in sys.orig_argv:
+        return False
+    name = os.path.splitext(os.path.basename(program))[0]
+    return name == "jaxmpc" or (program == "-m" and "jaxmpc.cli" in sys.orig_argv)
+
+
+if is_command() and hasattr(signal, "pthread_sigmask"):  # until `install`
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 import atexit
 import contextlib
 import functools
-import os
-import signal
+import logging
 import subprocess
-import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn
@@ -79,15 +97,17 @@ class _Exit:
 
     def leave(self) -> NoReturn:
         """Say so and end the process."""
-        _silence()
-        if not self.said:
-            self.said = True
-            text = self.spoken or " ".join(filter(None, map(_try, self.words)))
-            os.write(2, f"{stopped(text)}\n".encode())  # past a print that waits for its reader
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-        for last in (*reversed(self.removals), sys.stdout.flush):
-            _try(last)
-        os._exit(STATUS)
+        try:
+            _silence()
+            if not self.said:
+                self.said = True
+                text = self.spoken or " ".join(filter(None, map(_try, self.words)))
+                os.write(2, f"{stopped(text)}\n".encode())  # past a print that waits for its reader
+                os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+            for last in (*reversed(self.removals), sys.stdout.flush):
+                _try(last)
+        finally:
+            os._exit(STATUS)
 
 
 _exit = _Exit()
@@ -109,9 +129,6 @@ def _try(last: Callable[[], Any]) -> Any:
 
 def _silence() -> None:
     """What fails because it is being stopped is not worth a line."""
-    import logging
-    import warnings
-
     sys.excepthook = sys.unraisablehook = threading.excepthook = lambda *_: None
     logging.disable()
     warnings.simplefilter("ignore")
@@ -122,17 +139,11 @@ def stopped(text: str) -> str:
     return f"jaxmpc: stopped: {text}" if text else "jaxmpc: stopped"
 
 
-def is_command() -> bool:
-    """Whether this process is ``jaxmpc`` or ``python -m jaxmpc.cli``, and not a worker that it has spawned."""
-    program = sys.argv[0] if getattr(sys, "argv", None) else ""
-    if "--multiprocessing-fork" in sys.orig_argv:
-        return False
-    return Path(program).stem == "jaxmpc" or (program == "-m" and "jaxmpc.cli" in sys.orig_argv)
-
-
 def install() -> None:
     """From now on Ctrl-C ends this process with its line, also before `front_door` is reached."""
     _exit.install()
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 def front_door(main: Callable[[list[str] | None], int]) -> Callable[..., int]:
