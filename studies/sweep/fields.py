@@ -94,9 +94,7 @@ class Field:
             return tuple(value)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise InputError(path, value, expected)
-        if (
-            isinstance(value, int) and value.bit_length() > 63
-        ):  # of a CSV file, too large for a float or to be printed
+        if isinstance(value, int) and value.bit_length() > 63:  # no float has room for some of them
             raise InputError(path, f"{value.bit_length()} bits", expected)
         if math.isnan(value):
             raise InputError(path, value, expected)
