@@ -36,7 +36,6 @@ import subprocess
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any, NoReturn
 
 STATUS = 130  # what shells report for Ctrl-C

@@ -58,7 +58,8 @@ class Sensors(eqx.Module):
         known = jnp.abs(cv) < IMPLAUSIBLE  # false for what is not a number
         inside = (cv >= tuning.measurement_low) & (cv <= tuning.measurement_high)
         moving = repeated < tuning.frozen_limit
-        quality = jnp.where(known, jnp.where(inside, jnp.where(moving, GOOD, FROZEN), OUTSIDE), MISSING)
+        quality = jnp.where(inside, jnp.where(moving, GOOD, FROZEN), OUTSIDE)
+        quality = jnp.where(known, quality, MISSING).astype(int)
         bad = jnp.where(quality == GOOD, 0, self.bad + 1)
         return Sensors(value=cv, repeated=repeated, bad=bad, quality=quality, off=bad >= tuning.bad_limit)
 

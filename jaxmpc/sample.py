@@ -64,9 +64,11 @@ def checked(
     )
     if manual is None:
         manual = np.zeros(lead + mvs, dtype=bool)
-    elif np.shape(manual) != lead + mvs or np.result_type(manual) != np.bool_:
+    elif not isinstance(manual, jax.Array):
+        manual = np.asarray(manual)
+    if manual.shape != lead + mvs or manual.dtype != np.bool_:
         raise InputError("manual", _shown(manual), f"true or false for each of {_names(structure.mv_names)}")
-    return Sample(cv, setpoint, mv, manual if isinstance(manual, jax.Array) else np.asarray(manual))
+    return Sample(cv, setpoint, mv, manual)
 
 
 def checked_start(

@@ -12,6 +12,7 @@ from jaxmpc import status
 from jaxmpc.blocking import sample_moves
 from jaxmpc.controller import ContinuousController
 from jaxmpc.errors import InputError
+from jaxmpc.measurement import SensorFault, fault_errors
 from jaxmpc.mixed_integer import MixedIntegerController
 from jaxmpc.plan import Planner, solve_plan
 from jaxmpc.plant import WellPlant
@@ -215,7 +216,11 @@ def test_a_loop_with_targets_has_the_cvs_of_the_plant_and_pulls_the_inputs(
     targets = Reference([0.0, 200.0], [[50.0, 7500.0], [0.0, 7000.0]], 600.0)
     plant = WellPlant(actuator="step" if integer else "continuous")
     pulled = TargetController(structure, tuning, well_like_model, {"lift": 0.05})
-    run = simulate_with_targets(pulled, plant, reference, targets, noise=[5.0, 0.05], seed=2)
+    faults = fault_errors(structure, 60, [SensorFault("gas", "missing", 100.0, 50.0)])
+    broken = dict(faults=faults, position_feedback=True)
+    run = simulate_with_targets(pulled, plant, reference, targets, noise=[5.0, 0.05], seed=2, **broken)
+    assert run.quality.shape == (60, 2)
+    assert run.quality[:, 0].nonzero()[0].tolist() == [10, 11, 12, 13, 14]
     assert run.cv_names == ("gas", "oil")
     assert run.cv.shape == run.setpoint.shape == run.bias.shape == (60, 2)
     assert not run.fallback.any()
