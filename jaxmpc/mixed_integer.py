@@ -40,6 +40,7 @@ from jaxmpc.plan import Planner
 from jaxmpc.relaxation import Solved, relax
 from jaxmpc.relaxer import Relaxer, relaxations
 from jaxmpc.sample import Sample, checked, checked_start
+from jaxmpc.search import SearchResult
 from jaxmpc.step_response import StepResponseModel, check_match
 from jaxmpc.step_solver import StepSolver
 from jaxmpc.structure import Structure
@@ -95,6 +96,7 @@ class MixedIntegerControllers:
         self.solver = StepSolver(structure, tunings, models)
         self.switching = any(may_switch(tuning) for tuning in tunings)
         self._without: dict[bytes, MixedIntegerControllers] = {}
+        self._decides = False  # whether a step has been decided
         self.memory = lanes_of(
             [
                 Memory(structure, t, m.extended(max(structure.prediction_horizon, m.samples)))
@@ -197,21 +199,29 @@ class MixedIntegerControllers:
                 return ready
             return _instances(self.memory, relaxer.lanes, state, free_response, target)
 
-        relaxer, instances, results, roots = self.solver.solve(
-            instances_of,
-            root=None if root is None else relaxations(root, narrow.predictions),
-            previous_moves=np.asarray(state.plan),
-            warm=state.warm,
-            gap=self.gap,
-            time_limit=self.time_limit,
-            finish=self.finish,
-        )
+        try:
+            relaxer, instances, results, roots = self.solver.solve(
+                instances_of,
+                root=None if root is None else relaxations(root, narrow.predictions),
+                previous_moves=np.asarray(state.plan),
+                warm=state.warm,
+                gap=self.gap,
+                time_limit=self.time_limit,
+                finish=self.finish,
+            )
+        except InputError:  # moves without limits have ranges that follow from the measurements
+            if not self._decides:
+                raise
+            relaxer, instances, roots = narrow, ready, None
+            results = [SearchResult(None, np.inf, -np.inf, codes.FAILED, None, 0)] * self.count
+        self._decides = True
         good = np.array([result.x is not None for result in results])
         none = np.zeros(instances.lower.shape[-1])
         x = np.stack([none if r.x is None else r.x for r in results])
         if root is None:  # otherwise all that is remembered is there already
-            fits = roots.warm.row_price.shape[-1] == state.warm.row_price.shape[-1]
-            warm = roots.warm if fits else state.warm
+            warm = state.warm
+            if roots is not None and roots.warm.row_price.shape[-1] == warm.row_price.shape[-1]:
+                warm = roots.warm
             observed = state, free_response, instances, Solved(warm, *([np.zeros(self.count)] * 5))
         state, moves, recovering = self._remember(relaxer, observed, x, good)
         certified = lambda values: np.where(good, values, np.nan)  # noqa: E731

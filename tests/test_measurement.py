@@ -80,6 +80,21 @@ def test_an_absurd_number_is_left_out_without_validation_limits_too(made, well_l
     assert not column(infos, "fallback").any()
 
 
+@pytest.mark.slow
+def test_a_spike_that_makes_the_moves_too_many_to_search_holds_the_mvs_for_as_long_as_it_lasts(
+    well_like_model, small_structure, thesis_fields
+):
+    """Whole moves without any limit have a range that follows from the measurements."""
+    unlimited = {f"{kind}_{end}": [None, None] for kind in ("mv", "move") for end in ("low", "high")}
+    structure = dataclasses.replace(small_structure, integer_step=(0.02, None))
+    controller = controller_of(
+        "mixed-integer", well_like_model, structure, thesis_fields, **(unlimited | {"bias_cutoff": np.inf})
+    )
+    seen = lambda k, cv: np.array([cv[0], 9e11]) if k == 3 else cv  # noqa: E731
+    _, infos = closed(controller, Process(well_like_model), 6, seen=seen)
+    assert column(infos, "fallback").tolist() == [False, False, False, True, False, False]
+
+
 def test_the_bias_of_a_cv_without_measurements_is_kept_or_fades_as_configured(made):
     for more, factor in (({}, 1.0), ({"bias_decay": [50.0, np.inf]}, np.exp(-10.0 / 50.0))):
         controller = made("continuous", **more)
