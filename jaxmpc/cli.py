@@ -25,6 +25,7 @@ from jaxmpc.errors import InputError, MissingToolError, PlantError
 from jaxmpc.files import check_folder, check_target, write_atomically
 from jaxmpc.options import COMPARISONS, parser
 
+PLATFORM_VARIABLES = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")
 EXIT_OPTIMAL, EXIT_OTHER, EXIT_BAD_INPUT, EXIT_INFEASIBLE, EXIT_LIMIT = 0, 1, 2, 3, 4
 
 
@@ -91,16 +92,21 @@ def _provide_standard_streams() -> None:
 
 def _check_platform() -> None:
     """Refuse a platform of JAX that this machine does not have."""
-    for name in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME"):
-        if asked := os.environ.get(name):
-            import jax
+    asked = {name: os.environ[name] for name in PLATFORM_VARIABLES if os.environ.get(name)}
+    if not asked:
+        return
+    import jax
 
-            try:
-                jax.local_devices()  # of the platform that is used
-            except (RuntimeError, AssertionError):
-                jax.config.update(name.lower(), "")
-                there = ", ".join(sorted({"cpu", jax.default_backend()}))
-                raise InputError(name, asked, f"a platform that this machine has for JAX: {there}") from None
+    try:
+        jax.local_devices()  # of the platform that is used
+    except (RuntimeError, AssertionError):
+        for name in PLATFORM_VARIABLES:
+            jax.config.update(name.lower(), "")
+        there = sorted({"cpu", jax.default_backend()})
+        absent = [name for name, value in asked.items() if not set(value.split(",")) <= set(there)]
+        name = (absent or list(asked))[0]
+        expected = f"a platform that this machine has for JAX: {', '.join(there)}"
+        raise InputError(name, asked[name], expected) from None
 
 
 def _plan(options: argparse.Namespace) -> int:

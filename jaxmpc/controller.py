@@ -157,7 +157,7 @@ class Memory(eqx.Module):
                 jnp.where(known, demand, state.mv),
                 position,
                 jnp.where(missed != 0.0, last, state.last_move),
-                state.past_moves.at[-1].add(missed),
+                jnp.asarray(state.past_moves).at[-1].add(missed),
                 manual,
             ),
         )

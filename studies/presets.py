@@ -40,6 +40,9 @@ _THESIS: Fields = {
     "move_high": {CHOKE: CHOKE_STEP, LIFT: 200.0},
     "mean_move_limit": {CHOKE: 0.55, LIFT: None},
     "bias_cutoff": 1 / 20,
+    # what no sensor of this well measures, noise and the restart of a full tubing (95,000 m3/h of gas) included
+    "measurement_low": {GAS: -5000.0, OIL: -100.0},
+    "measurement_high": {GAS: 200_000.0, OIL: 2000.0},
 }
 
 

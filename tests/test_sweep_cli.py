@@ -290,7 +290,7 @@ def test_status_gives_the_command_that_goes_on(quick, file, tmp_path, monkeypatc
     monkeypatch.setattr(runner, "prepare_study", stop)
     words = ["tiny.toml", "--store", "my x.zarr", *(["--quick"] if quick else [])]
     assert main(["study", "run", *words]) == 130
-    assert "Give the same command again" in capsys.readouterr().out
+    assert "Give the same command again" in capsys.readouterr().err
     assert main(["study", "status", "my x.zarr"]) == 0
     out = capsys.readouterr().out
     assert f"0 of {4 if quick else 8} scenarios (0%)" in out
