@@ -33,24 +33,37 @@ class Sensors(eqx.Module):
     """What is remembered of the measurements.
 
     Attributes:
-        value: the last one, good or bad [CV unit].
-        repeated: how often in a row it has been the same [samples].
-        bad: how many in a row were left out [samples].
-        quality: code of the last one in `QUALITY`.
-        off: whether the CV is switched off.
+        value: the last ones, good or bad [CV unit].
+        counts: `repeated`, `bad`, `quality` and `off` in one array, as every array takes time at every step.
     """
 
     value: Float[Array, " cv"]
-    repeated: Int[Array, " cv"]
-    bad: Int[Array, " cv"]
-    quality: Int[Array, " cv"]
-    off: Bool[Array, " cv"]
+    counts: Int[Array, "4 cv"]
+
+    @property
+    def repeated(self) -> Int[Array, " cv"]:
+        """How often in a row the measurement has been the same [samples]."""
+        return self.counts[..., 0, :]
+
+    @property
+    def bad(self) -> Int[Array, " cv"]:
+        """How many in a row were left out [samples]."""
+        return self.counts[..., 1, :]
+
+    @property
+    def quality(self) -> Int[Array, " cv"]:
+        """Code of the last one in `QUALITY`."""
+        return self.counts[..., 2, :]
+
+    @property
+    def off(self) -> Bool[Array, " cv"]:
+        """Whether the CV is switched off."""
+        return self.counts[..., 3, :] > 0
 
     @classmethod
     def fresh(cls, cv: Float[Array, " cv"]) -> Sensors:
         """After a first good measurement [CV unit]."""
-        none = jnp.zeros(cv.shape, dtype=int)
-        return cls(value=cv, repeated=none, bad=none, quality=none, off=jnp.zeros(cv.shape, dtype=bool))
+        return cls(value=cv, counts=jnp.zeros((4, *cv.shape), dtype=int))
 
     def judged(self, tuning: Tuning, cv: Float[Array, " cv"]) -> Sensors:
         """After another measurement [CV unit], which may be anything."""
@@ -59,9 +72,10 @@ class Sensors(eqx.Module):
         inside = (cv >= tuning.measurement_low) & (cv <= tuning.measurement_high)
         moving = repeated < tuning.frozen_limit
         quality = jnp.where(inside, jnp.where(moving, GOOD, FROZEN), OUTSIDE)
-        quality = jnp.where(known, quality, MISSING).astype(int)
+        quality = jnp.where(known, quality, MISSING)
         bad = jnp.where(quality == GOOD, 0, self.bad + 1)
-        return Sensors(value=cv, repeated=repeated, bad=bad, quality=quality, off=bad >= tuning.bad_limit)
+        off = bad >= tuning.bad_limit
+        return Sensors(value=cv, counts=jnp.stack([repeated, bad, quality, off]).astype(int))
 
 
 @dataclasses.dataclass(frozen=True)
