@@ -225,15 +225,15 @@ class _Compiled:
     """A continuous controller that is stepped from the host, with a clock."""
 
     def __init__(self, controller: ContinuousController):
-        self.controller, self.init = controller, controller.init
+        self.init, self._decided = controller.init, controller.step  # binding a method takes a while
 
     def prepare(self, state, cv) -> None:
-        jax.block_until_ready(self.controller.step(state, cv, cv))
+        jax.block_until_ready(self._decided(state, cv, cv))
 
     def step(self, state, cv, fault, setpoint, mv):
         arrived = received(cv, fault, np.asarray(state.sensors.value))
         begin = time.perf_counter()
-        state, info = jax.block_until_ready(self.controller.step(state, arrived, setpoint, mv))
+        state, info = jax.block_until_ready(self._decided(state, arrived, setpoint, mv))
         record = record_of(cv, info.mv, state, info) | {"solve_time": time.perf_counter() - begin}
         return state, {name: np.asarray(value) for name, value in record.items()}
 
