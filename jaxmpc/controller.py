@@ -277,8 +277,8 @@ def may_switch(tuning: Tuning) -> bool:
 class ContinuousController(eqx.Module):
     """MPC with continuous moves (thesis chapter 5 with 6.2-6.4, 6.6).
 
-    `step` is compiled when it is first called, once per structure; inside `jax.jit`, `jax.vmap` and `jax.lax.scan` it is a
-    pure function of its arguments.
+    `step` is compiled when it is first called, once per structure: call it as it is. Inside functions that are given to
+    `jax.jit`, `jax.vmap` or `jax.lax.scan` it is a pure function of its arguments.
 
     Args:
         structure: static configuration without integer MVs.

@@ -72,3 +72,19 @@ def thesis_fields():
 def small_tuning(small_structure, thesis_fields):
     """The thesis-like tuning for `small_structure`, with oscillation rows."""
     return make_tuning(small_structure, **thesis_fields, oscillation_rows={"choke": True})
+
+
+@pytest.fixture(scope="module")
+def made(well_like_model, small_structure, thesis_fields):
+    """Controllers by kind (`five_controllers`) and changed tuning fields, each made once."""
+    from tests.five_controllers import controller_of
+
+    known = {}
+
+    def get(kind, **more):
+        key = kind, repr(sorted(more.items()))
+        if key not in known:
+            known[key] = controller_of(kind, well_like_model, small_structure, thesis_fields, **more)
+        return known[key]
+
+    return get

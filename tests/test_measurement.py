@@ -18,20 +18,6 @@ from tests.five_controllers import KINDS, SETPOINT, START, Process, closed, cont
 CHOSEN = {"measurement_low": [0.0, 0.0], "measurement_high": [30000.0, 500.0]}
 
 
-@pytest.fixture(scope="module")
-def made(well_like_model, small_structure, thesis_fields):
-    """Controllers by kind, made once."""
-    known = {}
-
-    def get(kind, **more):
-        key = kind, repr(sorted(more.items()))
-        if key not in known:
-            known[key] = controller_of(kind, well_like_model, small_structure, thesis_fields, **more)
-        return known[key]
-
-    return get
-
-
 def column(infos, name):
     return np.array([np.asarray(getattr(info, name)) for info in infos])
 

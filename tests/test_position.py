@@ -4,23 +4,9 @@ import numpy as np
 import pytest
 
 from jaxmpc.controller import ContinuousController
-from tests.five_controllers import KINDS, SETPOINT, START, Process, closed, controller_of, stepped, tuned
+from tests.five_controllers import KINDS, SETPOINT, START, Process, closed, stepped, tuned
 
 FAR = np.array([14000.0, 230.0])
-
-
-@pytest.fixture(scope="module")
-def made(well_like_model, small_structure, thesis_fields):
-    """Controllers by kind, made once."""
-    known = {}
-
-    def get(kind, **more):
-        key = kind, repr(sorted(more.items()))
-        if key not in known:
-            known[key] = controller_of(kind, well_like_model, small_structure, thesis_fields, **more)
-        return known[key]
-
-    return get
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -11,20 +11,7 @@ from jaxmpc.controller import ContinuousController
 from jaxmpc.errors import InputError
 from jaxmpc.mixed_integer import MixedIntegerController, MixedIntegerControllers
 from jaxmpc.plan import Planner
-from tests.five_controllers import KINDS, SETPOINT, START, controller_of, stepped, tuned
-
-
-@pytest.fixture(scope="module")
-def made(well_like_model, small_structure, thesis_fields):
-    """Controllers by kind, made once."""
-    known = {}
-
-    def get(kind):
-        if kind not in known:
-            known[kind] = controller_of(kind, well_like_model, small_structure, thesis_fields)
-        return known[kind]
-
-    return get
+from tests.five_controllers import KINDS, SETPOINT, START, stepped, tuned
 
 
 @pytest.mark.parametrize("kind", KINDS)
