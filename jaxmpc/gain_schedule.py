@@ -26,14 +26,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxmpc.condense import condense
 from jaxmpc.controller import ContinuousController, ControllerState, StepInfo
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
 from jaxmpc.mixed_integer import MixedIntegerController, MixedIntegerControllers
-from jaxmpc.sample import Sample, checked
+from jaxmpc.sample import Sample
 from jaxmpc.step_response import StepResponseModel, advance_free_response, make_model
 from jaxmpc.structure import Structure
 from jaxmpc.tuning import Tuning
@@ -300,21 +300,13 @@ class ScheduledMixedIntegerControllers(MixedIntegerControllers):
         used = controllers.memory.lane(0).coefficients
         _corrected(self.schedule, used, state.future[0], state.mv[0], state.last_move[0])
 
-    def step(
-        self,
-        state: ControllerState,
-        cv: Float[ArrayLike, "scenario cv"],
-        setpoint: Float[ArrayLike, "scenario cv"] | Float[ArrayLike, "scenario horizon cv"],
-        mv: Float[ArrayLike, "scenario mv"] | None = None,
-        manual: Bool[ArrayLike, "scenario mv"] | None = None,
-    ) -> tuple[ControllerState, StepInfo]:
-        """One sample; arguments as in `MixedIntegerControllers.step`. Its time includes the making of a controller."""
+    def decide(self, state: ControllerState, sample: Sample) -> tuple[ControllerState, StepInfo]:
+        """`step` of a checked sample. Its time includes the making of a controller."""
         begin = time.perf_counter()
-        sample = checked(self.structure, cv, setpoint, mv, manual, lanes=1)
         before = np.where(np.isfinite(sample.mv[0]), sample.mv[0], np.asarray(state.mv)[0])
         controllers = self.at(before)
         made = time.perf_counter() - begin
-        state, info = controllers.step(state, *sample)
+        state, info = controllers.decide(state, sample)
         begin = time.perf_counter()
         # moves of the others are too small to matter
         if np.any(info.move[0, list(self.structure.integer_mvs)]):

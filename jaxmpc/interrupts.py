@@ -40,9 +40,7 @@ from typing import Any, NoReturn
 
 STATUS = 130  # what shells report for Ctrl-C
 GRACE = 1.0  # s for a command to unwind
-TIDY = (
-    0.5  # s for each of the last things to do, such as that the reader of standard output takes what is left
-)
+TIDY = 0.5  # s for each of the last things to do; the reader of standard output may keep it waiting
 
 
 class _Exit:

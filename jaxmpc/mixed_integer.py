@@ -166,6 +166,10 @@ class MixedIntegerControllers:
     ) -> tuple[ControllerState, StepInfo]:
         """One sample of all scenarios; arguments as in `ContinuousController.step`, the scenario axis first."""
         sample = checked(self.structure, cv, setpoint, mv, manual, lanes=self.count)
+        return self.decide(state, sample)
+
+    def decide(self, state: ControllerState, sample: Sample) -> tuple[ControllerState, StepInfo]:
+        """`step` of a checked sample."""
         return self._switched(state, sample)._decide(state, sample)
 
     def _switched(self, state: ControllerState, sample: Sample) -> MixedIntegerControllers:
@@ -467,7 +471,7 @@ class MixedIntegerController:
         """One sample; arguments and errors as in `ContinuousController.step`."""
         sample = checked(self.structure, cv, setpoint, mv, manual)
         lane, of_lane = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (state, sample))
-        return _first(self.together.step(lane, *of_lane))
+        return _first(self.together.decide(lane, of_lane))
 
 
 def _first(tree):

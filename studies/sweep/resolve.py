@@ -354,59 +354,58 @@ def _located(settings: Settings, plant: dict[str, np.ndarray], error: InputError
 
 def _pressure(settings: Settings, variants: tuple[Variant, ...], variant: np.ndarray) -> np.ndarray:
     """Pressure steps "scenario step 2"; every step lies within every run."""
-    steps = settings.base.get("disturbance", ())
-    keys = ("disturbance.time", "disturbance.offset")
-    varied = [key for key in keys if settings.table.column(key) is not None]
-    if varied and len(steps) != 1:
-        path = settings.table.blame(varied[:1], 0)
-        expected = "exactly one [[base.disturbance]], whose time or offset the axis replaces"
-        raise InputError(path, f"{len(steps)} steps", expected)
-    columns = [
-        settings.numbers(key) if key in varied else np.array([getattr(step, key.rpartition(".")[2])])
-        for step in steps
-        for key in keys
-    ]
-    if not columns:
-        return np.zeros((1, 0, 2))
-    out = np.stack(np.broadcast_arrays(*columns), axis=1).reshape(-1, len(steps), 2)
-    durations = np.array([v.reference.duration for v in variants])
-    late = np.broadcast_to(out[:, :, 0] >= durations[variant][:, None], (len(variant), len(steps)))
-    for k, i in np.argwhere(late)[:1].tolist():
-        path = settings.table.blame(["disturbance.time"], k) if varied else f"base.disturbance[{i}].time"
-        expected = f"a time within the run of {durations[variant[k]]:g} s"
-        raise InputError(path, float(row(out, k)[i, 0]), expected)
-    return out
+    return _events(settings, variants, variant, "disturbance", ("time", "offset"))
 
 
 def _sensor_faults(settings: Settings, variants: tuple[Variant, ...], variant: np.ndarray) -> np.ndarray:
     """Sensor faults "scenario fault 3"; every one begins within every run."""
-    faults = settings.base.get("sensor_fault", ())
-    keys = [f"sensor_fault.{name}" for name in ("time", "duration", "size")]
+    out = _events(settings, variants, variant, "sensor_fault", ("time", "duration", "size"))
+    _refuse(
+        settings, "sensor_fault.duration", out[:, :, 1], out[:, :, 1] <= 0, lambda _: "a duration above 0 s"
+    )
+    return out
+
+
+def _events(
+    settings: Settings,
+    variants: tuple[Variant, ...],
+    variant: np.ndarray,
+    table: str,
+    names: tuple[str, ...],
+) -> np.ndarray:
+    """What ``[[base.TABLE]]`` lists, "scenario event name"; the first name is the time, which lies within every run.
+
+    What is not given is one sample long.
+    """
+    events = settings.base.get(table, ())
+    keys = [f"{table}.{name}" for name in names]
     varied = [key for key in keys if settings.table.column(key) is not None]
-    if varied and len(faults) != 1:
+    if varied and len(events) != 1:
         path = settings.table.blame(varied[:1], 0)
-        expected = "exactly one [[base.sensor_fault]], whose values the axis replaces"
-        raise InputError(path, f"{len(faults)} faults", expected)
-    dt = variants[0].structure.dt  # one sample where no duration is given
-    given = lambda fault, key: getattr(fault, key.rpartition(".")[2])  # noqa: E731
+        expected = f"exactly one [[base.{table}]], whose {' or '.join(names)} the axis replaces"
+        raise InputError(path, f"{len(events)} of them", expected)
+    given = lambda event, name: variants[0].structure.dt if (v := getattr(event, name)) is UNSET else v  # noqa: E731
     columns = [
-        settings.numbers(key)
-        if key in varied
-        else np.array([dt if given(fault, key) is UNSET else given(fault, key)])
-        for fault in faults
-        for key in keys
+        settings.numbers(key) if key in varied else np.array([given(event, name)])
+        for event in events
+        for key, name in zip(keys, names, strict=True)
     ]
     if not columns:
-        return np.zeros((1, 0, 3))
-    out = np.stack(np.broadcast_arrays(*columns), axis=1).reshape(-1, len(faults), 3)
-    durations = np.array([v.reference.duration for v in variants])
-    late = np.broadcast_to(out[:, :, 0] >= durations[variant][:, None], (len(variant), len(faults)))
-    for wrong, key, place, expected in (
-        (late, keys[0], 0, lambda k: f"a time within the run of {durations[variant[k]]:g} s"),
-        (np.broadcast_to(out[:, :, 1] <= 0, late.shape), keys[1], 1, lambda _: "a duration above 0 s"),
-    ):
-        for k, i in np.argwhere(wrong)[:1].tolist():
-            inside = key.replace(".", f"[{i}].")
-            path = settings.table.blame([key], k) if key in varied else f"base.{inside}"
-            raise InputError(path, float(row(out, k)[i, place]), expected(k))
+        return np.zeros((1, 0, len(names)))
+    out = np.stack(np.broadcast_arrays(*columns), axis=1).reshape(-1, len(events), len(names))
+    durations = np.array([v.reference.duration for v in variants])[variant]
+    late = out[:, :, 0] >= durations[:, None]
+    expected = lambda k: f"a time within the run of {durations[k]:g} s"  # noqa: E731
+    _refuse(settings, keys[0], out[:, :, 0], late, expected)
     return out
+
+
+def _refuse(
+    settings: Settings, key: str, values: np.ndarray, wrong: np.ndarray, expected: Callable[[int], str]
+) -> None:
+    """An `InputError` for the first wrong number "scenario event" of a key of listed events, by its path."""
+    table, _, name = key.partition(".")
+    for k, i in np.argwhere(wrong)[:1].tolist():
+        axis = any(settings.table.column(f) is not None for f in FIELDS if f.startswith(f"{table}."))
+        path = settings.table.blame([key], k) if axis else f"base.{table}[{i}].{name}"
+        raise InputError(path, float(row(values, k)[i]), expected(k))

@@ -408,7 +408,7 @@ def _groups(inputs: Inputs, count: int) -> tuple[Group, ...]:
     tuning = inputs.tuning
     limited = np.any(np.isfinite(tuning["cv_low"]) | np.isfinite(tuning["cv_high"]), axis=1)
     reach = np.maximum(-tuning["move_low"][:, 0], tuning["move_high"][:, 0])  # of the choke [%]
-    switching = np.isfinite(tuning["bad_limit"]).any(axis=1)
+    switching = np.any(np.isfinite(tuning["bad_limit"]), axis=1)
     members: dict[tuple[Any, Any, Any, int, bool, int, bool], list[int]] = {}
     for k in range(count):
         variant = inputs.variants[inputs.variant[k]]
@@ -422,7 +422,7 @@ def _groups(inputs: Inputs, count: int) -> tuple[Group, ...]:
             variant.samples,
             bool(row(limited, k)),
             steps,
-            bool(row(np.asarray(switching), k)),
+            bool(row(switching, k)),
         )
         members.setdefault(key, []).append(k)
     groups = []
