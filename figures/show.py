@@ -22,8 +22,8 @@ from figures.explore import is_comparison
 from figures.sweep import run_results
 from figures.sweep_data import load
 from jaxmpc.errors import InputError
-from jaxmpc.trajectory import Trajectory
-from jaxmpc.tuning import Tuning
+from jaxmpc.loop.trajectory import Trajectory
+from jaxmpc.problem.tuning import Tuning
 from studies.evaluate import completed
 from studies.store import open_results
 
@@ -49,9 +49,9 @@ def plot(
     """Draw something; numbers as they are, units where they are known.
 
     Args:
-        thing: `jaxmpc.step_response.StepResponseModel` (each step response), `jaxmpc.tuning.Tuning` (cost of a deviation per
-            CV), `jaxmpc.plan.Plan` (predicted CVs, planned MVs), `jaxmpc.trajectory.Trajectory`, or a study: the path of its
-            store or what `open_study` or `open_results` gave (sweeps: choke wear against deviation).
+        thing: `StepResponseModel` (each step response), `Tuning` (cost of a deviation per CV), `Plan` (predicted CVs,
+            planned MVs), `Trajectory`, or a study: the path of its store or what `open_study` or
+            `open_results` gave (sweeps: choke wear against deviation).
         tuning: of a trajectory, for its deadzones.
         structure: of a tuning or a plan, for names and units.
 

@@ -10,7 +10,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from figures import panels, style
-from jaxmpc.well import CV_NAMES, CV_UNITS
+from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS
 from studies.presets import GAS, OIL, TUNINGS
 
 CV_UNIT = dict(zip(CV_NAMES, CV_UNITS, strict=True))

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from figures import fan, maps, panels, regret, style, wear
 from figures.sweep_data import load, sweep_axes
 from figures.wear import pareto
-from jaxmpc.trajectory import Trajectory
+from jaxmpc.loop.trajectory import Trajectory
 
 __all__ = ["draw_run", "draw_sweep", "pages", "pareto"]
 

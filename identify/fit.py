@@ -21,9 +21,9 @@ import numpy as np
 
 from jaxmpc.errors import InputError
 from jaxmpc.files import check_target
-from jaxmpc.plant import STATE_SCALE, JaxOps, check_inputs, rates, runge_kutta, steady_state
-from jaxmpc.step_response import FORMAT, StepResponseModel, make_model
-from jaxmpc.well import (
+from jaxmpc.model.step_response import FORMAT, StepResponseModel, make_model
+from jaxmpc.process.plant import STATE_SCALE, JaxOps, check_inputs, rates, runge_kutta, steady_state
+from jaxmpc.process.well.equations import (
     CV_NAMES,
     DEFAULT_CHOKE,
     DEFAULT_LIFT,

@@ -23,13 +23,21 @@ import numpy as np
 
 from identify.fmu_process import TIME_LIMIT, FmuProcess
 from identify.fmu_source import MODEL_IDENTIFIER, fmu_files
-from jaxmpc.actuator import check_actuator, move_choke
-from jaxmpc.cache import cache_folder, read_sealed, sealed
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.files import write_atomically
-from jaxmpc.interrupts import in_the_end, run_program
-from jaxmpc.plant import STATE_SCALE, WellOutputs, check_inputs
-from jaxmpc.well import DEFAULT_CHOKE, DEFAULT_LIFT, INPUTS, OUTPUTS, STATES, WellParameters, check_parameters
+from jaxmpc.process.actuator import check_actuator, move_choke
+from jaxmpc.process.plant import STATE_SCALE, WellOutputs, check_inputs
+from jaxmpc.process.well.equations import (
+    DEFAULT_CHOKE,
+    DEFAULT_LIFT,
+    INPUTS,
+    OUTPUTS,
+    STATES,
+    WellParameters,
+    check_parameters,
+)
+from jaxmpc.programs.cache import cache_folder, read_sealed, sealed
+from jaxmpc.programs.interrupts import in_the_end, run_program
 
 # No fused multiply-adds: the FMU and the JAX plant then round alike.
 COMPILER_FLAGS = "-O2 -ffp-contract=off -fno-math-errno"
@@ -160,14 +168,14 @@ def validate_fmu(path: str | Path) -> list[str]:
 
 
 class FmuPlant:
-    """An FMU of the well, stepped like `jaxmpc.plant.WellPlant`, with its state in a process of its own.
+    """An FMU of the well, stepped like `jaxmpc.process.plant.WellPlant`, with its state in a process of its own.
 
     Use it as a context manager, or `close` it; that ends the process and removes the unpacked files. One
     instance serves any number of runs: `init` resets it.
 
     Args:
         path: of the FMU; by default the shipped well, built on first use (FMI 2.0).
-        actuator: ``continuous`` or ``step``, see `jaxmpc.actuator`.
+        actuator: ``continuous`` or ``step``, see `jaxmpc.process.actuator`.
         dt: sampling interval [s].
         time_limit: for one call of the FMU [s].
 
@@ -235,7 +243,7 @@ class FmuPlant:
             choke: position [%], 0..100.
             lift: lift rate [m3/h], 0 or more.
             disturbance: offset of the reservoir pressure [bar].
-            x: ``"8"``, states to start from instead, in the order and units of `jaxmpc.well.STATES`.
+            x: ``"8"``, states to start from instead, in the order and units of `jaxmpc.process.well.equations.STATES`.
 
         Raises:
             InputError: for inputs outside their range, or states of the wrong shape or not finite.
@@ -300,7 +308,7 @@ class FmuPlant:
 
     @property
     def x(self) -> np.ndarray:
-        """``"8"``, the states in the order and units of `jaxmpc.well.STATES`."""
+        """``"8"``, the states in the order and units of `jaxmpc.process.well.equations.STATES`."""
         return np.array(self._fmu.get(STATE_NAMES))
 
     def close(self) -> None:

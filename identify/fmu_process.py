@@ -22,7 +22,7 @@ from typing import Any
 
 from identify.fmu_worker import NOTE, NOTE_BYTES, UNPACKED
 from jaxmpc.errors import InputError, PlantError
-from jaxmpc.interrupts import before_leaving
+from jaxmpc.programs.interrupts import before_leaving
 
 TIME_LIMIT = 300.0  # s for one call of an FMU
 GOODBYE = 10.0  # s for an FMU to free itself

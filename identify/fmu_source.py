@@ -1,6 +1,6 @@
 """C sources and model description of the well's FMU, generated from the one model function (thesis 3.2.1).
 
-`jaxmpc.well.model` is traced with SymPy, common subexpressions are taken out, and the result becomes
+`jaxmpc.process.well.equations.model` is traced with SymPy, common subexpressions are taken out, and the result becomes
 ``model.h``. The C files in ``fmu_sources`` add the integration and the FMI 2.0 and 3.0 co-simulation
 interfaces. Nothing here runs a compiler or imports FMPy: see `identify.fmu`.
 """
@@ -16,7 +16,7 @@ from xml.sax.saxutils import quoteattr
 import sympy
 from sympy.printing.c import C99CodePrinter
 
-from jaxmpc.well import (
+from jaxmpc.process.well.equations import (
     DEFAULT_CHOKE,
     DEFAULT_LIFT,
     INPUTS,
@@ -133,7 +133,7 @@ def start_state(parameters: WellParameters) -> tuple[float, ...]:
     """Steady state at 50 % and 7500 m3/h: the shipped one, or that of other parameters."""
     if parameters_to_dict(parameters) == parameters_to_dict(WellParameters()):
         return SHIPPED_STEADY_STATE
-    from jaxmpc.plant import WellPlant
+    from jaxmpc.process.plant import WellPlant
 
     return tuple(float(v) for v in WellPlant(parameters).init().x)
 

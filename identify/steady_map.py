@@ -1,6 +1,6 @@
 """The steady map of a well, for the real-time optimisation of thesis 6.7: steady rates over choke and lift.
 
-`jaxmpc.rto` optimises over it; the grid has the positions of the 2 % step choke, so that the map is exact there.
+`jaxmpc.steady.optimise` optimises over it; the grid has the positions of the 2 % step choke, so that the map is exact there.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from identify.sweep import steady_sweep
-from jaxmpc.plant import WellPlant
-from jaxmpc.steady_map import SteadyMap
-from jaxmpc.well import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS, well_hash
+from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS, well_hash
+from jaxmpc.steady.map import SteadyMap
 
 CHOKES = np.arange(2.0, 101.0, 2.0)  # %, the positions of the step choke
 LIFTS = np.r_[0.0:2000.0:500.0, 2000.0:10_001.0:1000.0]  # m3/h, finer where the gain of the lift changes most

@@ -15,9 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.errors import InputError
-from jaxmpc.plant import WellPlant, check_inputs
-from jaxmpc.step_response import StepResponseModel, make_model
-from jaxmpc.well import CV_NAMES, CV_UNITS, DEFAULT_CHOKE, DEFAULT_LIFT, MV_NAMES, MV_UNITS, well_hash
+from jaxmpc.model.step_response import StepResponseModel, make_model
+from jaxmpc.process.plant import WellPlant, check_inputs
+from jaxmpc.process.well.equations import (
+    CV_NAMES,
+    CV_UNITS,
+    DEFAULT_CHOKE,
+    DEFAULT_LIFT,
+    MV_NAMES,
+    MV_UNITS,
+    well_hash,
+)
 
 SETTLE_SAMPLES = 60  # held at the working point before a step
 SETTLED_SHARE = 0.01  # of the largest coefficient; a settled response moves less over its last tenth

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.errors import InputError
-from jaxmpc.plant import STATE_SCALE, WellPlant, check_inputs, rates, steady_state
-from jaxmpc.well import CV_NAMES, WellParameters
+from jaxmpc.process.plant import STATE_SCALE, WellPlant, check_inputs, rates, steady_state
+from jaxmpc.process.well.equations import CV_NAMES, WellParameters
 
 LIFTS = (5000.0, 7500.0, 10000.0)  # m3/h, the three curves of figures 10 and 11
 

@@ -6,7 +6,7 @@ process starts without compiling; set ``JAX_COMPILATION_CACHE_DIR`` to move it o
 to leave it off. The public names of its modules can be taken from the package itself.
 """
 
-from jaxmpc import interrupts as _interrupts
+from jaxmpc.programs import interrupts as _interrupts
 
 if _interrupts.is_command():  # before everything else, as JAX takes a while
     _interrupts.install()
@@ -16,37 +16,37 @@ from importlib import import_module as _import_module
 
 import jax as _jax
 
-from jaxmpc.cache import keep_programs as _keep_programs
+from jaxmpc.programs.cache import keep_programs as _keep_programs
 
 _jax.config.update("jax_enable_x64", True)
 if not _os.environ.get("JAXMPC_NO_JIT_CACHE"):
     _keep_programs()
 
 _HOME_OF = {
-    "ContinuousController": "controller",
+    "ContinuousController": "controller.continuous",
     "InputError": "errors",
-    "MixedIntegerController": "mixed_integer",
-    "MixedIntegerControllers": "mixed_integer",
-    "Reference": "reference",
-    "SensorFault": "measurement",
-    "SteadyMap": "steady_map",
-    "StepResponseModel": "step_response",
-    "Structure": "structure",
-    "TargetController": "targets",
-    "Trajectory": "trajectory",
-    "WellPlant": "plant",
-    "controller_batch": "batch",
-    "fault_errors": "measurement",
-    "load_controller": "checkpoint",
-    "make_model": "step_response",
-    "make_tuning": "tuning",
-    "optimise": "rto",
-    "save_controller": "checkpoint",
-    "simulate": "closed_loop",
-    "simulate_batch": "closed_loop",
-    "simulate_batches": "closed_loop",
-    "solve_plan": "plan",
-    "stack_tunings": "tuning",
+    "MixedIntegerController": "controller.mixed_integer",
+    "MixedIntegerControllers": "controller.mixed_integer",
+    "Reference": "loop.reference",
+    "SensorFault": "controller.measurement",
+    "SteadyMap": "steady.map",
+    "StepResponseModel": "model.step_response",
+    "Structure": "problem.structure",
+    "TargetController": "controller.targets",
+    "Trajectory": "loop.trajectory",
+    "WellPlant": "process.plant",
+    "controller_batch": "controller.batch",
+    "fault_errors": "controller.measurement",
+    "load_controller": "controller.checkpoint",
+    "make_model": "model.step_response",
+    "make_tuning": "problem.tuning",
+    "optimise": "steady.optimise",
+    "save_controller": "controller.checkpoint",
+    "simulate": "loop.simulate",
+    "simulate_batch": "loop.simulate",
+    "simulate_batches": "loop.simulate",
+    "solve_plan": "controller.plan",
+    "stack_tunings": "problem.tuning",
 }
 
 

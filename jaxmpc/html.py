@@ -159,7 +159,7 @@ def named(names: Sequence[str], units: Sequence[str], k: int, kind: str) -> str:
 
 
 def step_response(model: Any) -> str:
-    """A `jaxmpc.step_response.StepResponseModel`: a chart per CV and MV, with names, units and working point."""
+    """A `jaxmpc.model.step_response.StepResponseModel`: a chart per CV and MV, with names, units and working point."""
     known = {"sampling interval": f"{model.dt:g} s"}
     known |= {name: number(value) for name, value in model.working_point}
     origin = {key: number(value) for key, value in model.provenance if isinstance(value, str | bool)}
@@ -185,7 +185,7 @@ def step_response(model: Any) -> str:
 
 
 def tuning(values: Any, units: Mapping[str, str], defaults: Mapping[str, Any]) -> str:
-    """A `jaxmpc.tuning.Tuning`: value, unit and default of each field.
+    """A `jaxmpc.problem.tuning.Tuning`: value, unit and default of each field.
 
     Args:
         values: the tuning.
@@ -201,7 +201,7 @@ def tuning(values: Any, units: Mapping[str, str], defaults: Mapping[str, Any]) -
 
 
 def plan(solved: Any) -> str:
-    """A `jaxmpc.plan.Plan`: how it was solved, planned MVs and predicted CVs as charts, moves per block."""
+    """A `jaxmpc.controller.plan.Plan`: how it was solved, planned MVs and predicted CVs as charts, moves per block."""
     known = {"objective": solved.objective, "bound": solved.bound, "relative gap": solved.gap}
     parts = [facts({name: number(value) for name, value in known.items()})]
     how = {"finished by": solved.finished_by, "relaxations": solved.nodes}
@@ -221,7 +221,7 @@ def plan(solved: Any) -> str:
 
 
 def trajectory(run: Any) -> str:
-    """A `jaxmpc.trajectory.Trajectory`: CVs with their setpoints, MVs, and how the samples were solved."""
+    """A `jaxmpc.loop.trajectory.Trajectory`: CVs with their setpoints, MVs, and how the samples were solved."""
     rows = []
     for c, name in enumerate(run.cv_names):
         drawn = chart(

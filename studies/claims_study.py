@@ -15,9 +15,9 @@ import numpy as np
 
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
-from jaxmpc.host_well import HostWell
-from jaxmpc.plant import WellPlant
-from jaxmpc.step_response import StepResponseModel
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.host import HostWell
 from studies import catalogue
 from studies.claims import ROWS, Claim, Evidence, judge, tables
 from studies.comparison import is_current, run_controller

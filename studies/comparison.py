@@ -20,14 +20,14 @@ import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
-from jaxmpc.closed_loop import simulate
-from jaxmpc.controller import ContinuousController
+from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.controller.schedule import ModelSchedule, ScheduledController, ScheduledMixedIntegerController
 from jaxmpc.errors import InputError
-from jaxmpc.gain_schedule import ModelSchedule, ScheduledController, ScheduledMixedIntegerController
-from jaxmpc.mixed_integer import MixedIntegerController
-from jaxmpc.step_response import StepResponseModel
-from jaxmpc.trajectory import Trajectory
-from jaxmpc.tuning import Tuning
+from jaxmpc.loop.simulate import simulate
+from jaxmpc.loop.trajectory import Trajectory
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.problem.tuning import Tuning
 from studies.definition import ComparisonDefinition, ControllerDefinition
 from studies.fingerprint import content_hash, source_hash, versions
 from studies.store import (

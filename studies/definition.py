@@ -13,9 +13,9 @@ import msgspec
 import numpy as np
 
 from jaxmpc.errors import InputError
-from jaxmpc.reference import Reference
-from jaxmpc.structure import Structure
-from jaxmpc.tuning import Tuning
+from jaxmpc.loop.reference import Reference
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import Tuning
 from studies import presets
 
 PlantKind = Literal["fmu", "jax"]
@@ -23,7 +23,7 @@ PLANTS: tuple[PlantKind, ...] = ("fmu", "jax")
 
 
 class ReferenceDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Setpoints over time; see `jaxmpc.reference.Reference`.
+    """Setpoints over time; see `jaxmpc.loop.reference.Reference`.
 
     Attributes:
         times: change times [s].
@@ -54,7 +54,7 @@ class TuningChange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         at: time from which it holds [s]; the first sample at or after it is the first that it decides.
-        changes: fields of `jaxmpc.tuning.Tuning` that replace those of the tuning before.
+        changes: fields of `jaxmpc.problem.tuning.Tuning` that replace those of the tuning before.
     """
 
     at: float
@@ -71,12 +71,12 @@ class ControllerDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
         actuator: ``continuous`` or ``step`` choke.
         blocking: ``moves``, ``inputs`` or ``none``; see `studies.presets.structure`.
         tuning: name of a preset in `studies.presets.TUNINGS`.
-        changes: fields of `jaxmpc.tuning.Tuning` that replace those of the preset.
+        changes: fields of `jaxmpc.problem.tuning.Tuning` that replace those of the preset.
         then: later tunings, in order of time; the controller keeps its state.
         open_loop_from: the plan of this time [s] is carried out to its end, whatever the well does; never if None.
         time_limit: of one step [s], for a mixed-integer controller; None for none.
-        mean_move_mode: ``reactive`` or ``predictive``; see `jaxmpc.structure.Structure`.
-        schedule: whether the model follows the MVs, see `jaxmpc.gain_schedule`.
+        mean_move_mode: ``reactive`` or ``predictive``; see `jaxmpc.problem.structure.Structure`.
+        schedule: whether the model follows the MVs, see `jaxmpc.controller.schedule`.
     """
 
     name: str

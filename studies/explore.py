@@ -17,16 +17,16 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from jaxmpc.closed_loop import simulate
-from jaxmpc.controller import ContinuousController
+from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.mixed_integer import MixedIntegerController
 from jaxmpc.errors import InputError
-from jaxmpc.mixed_integer import MixedIntegerController
-from jaxmpc.plant import WellPlant
-from jaxmpc.reference import Reference
-from jaxmpc.step_response import StepResponseModel
-from jaxmpc.structure import Structure
-from jaxmpc.trajectory import RECORDABLE, Trajectory, TrajectoryBatch
-from jaxmpc.tuning import Tuning
+from jaxmpc.loop.reference import Reference
+from jaxmpc.loop.simulate import simulate
+from jaxmpc.loop.trajectory import RECORDABLE, Trajectory, TrajectoryBatch
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import Tuning
+from jaxmpc.process.plant import WellPlant
 from studies import presets, references
 from studies.plans import StoredPlan, plan_at
 from studies.presets import CHOKE, GAS, OIL

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from jaxmpc.controller import ControllerState, Memory
-from jaxmpc.mixed_integer import MixedIntegerController
+from jaxmpc.controller.continuous import ControllerState, Memory
+from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.status import LIMIT
-from jaxmpc.step_response import StepResponseModel
 from studies import references
 from studies.definition import ComparisonDefinition, ControllerDefinition, PlantKind, ReferenceDefinition
 

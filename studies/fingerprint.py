@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 
 # Modules of `jaxmpc` that no closed loop depends on.
-EDGE_MODULES = ("case", "cli", "html", "options", "plan", "rto", "rto_milp", "steady_map")
+EDGE_FOLDERS = ("cli", "steady")
+EDGE_MODULES = ("html", "controller/case", "controller/plan")
 
 
 def content_hash(*parts: Any) -> str:
@@ -56,7 +57,7 @@ def source_hash(package: str) -> str:
     trees = {}
     for path in sorted(folder.rglob("*.py")):
         name = path.relative_to(folder).with_suffix("").as_posix()
-        if name not in EDGE_MODULES:
+        if name not in EDGE_MODULES and name.split("/")[0] not in EDGE_FOLDERS:
             trees[name] = ast.dump(_without_docstrings(ast.parse(path.read_text())))
     return content_hash(trees)
 

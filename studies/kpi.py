@@ -179,7 +179,7 @@ def closed_loop_cost(
     """Tracking and move cost of (6.6) on what happened instead of a prediction, per sample.
 
     mean_k [sum_i (Q e^2 + S h^2 + s h) + sum_j P m^2] with e = |y[k] - r[k]| and h = max(e - c, 0); weights as in
-    `jaxmpc.tuning.Tuning`. The price of CV limits is left out: it is one per horizon, not per sample.
+    `jaxmpc.problem.tuning.Tuning`. The price of CV limits is left out: it is one per horizon, not per sample.
     """
     deviation = jnp.abs(jnp.asarray(cv) - jnp.asarray(setpoint))
     beyond = jnp.maximum(deviation - jnp.asarray(deadzone), 0.0)

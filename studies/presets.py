@@ -12,9 +12,9 @@ import copy
 from typing import Any, Literal
 
 from jaxmpc.errors import InputError
-from jaxmpc.structure import Structure
-from jaxmpc.tuning import Tuning, make_tuning
-from jaxmpc.well import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import Tuning, make_tuning
+from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS
 
 CHOKE, LIFT = MV_NAMES
 GAS, OIL = CV_NAMES

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from jaxmpc.reference import Reference
+from jaxmpc.loop.reference import Reference
 
 # start [s], gas rate [m3/h], oil rate [m3/h]
 THESIS_WINDOWS = (

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from jaxmpc.files import write_atomically
-from jaxmpc.step_response import StepResponseModel
+from jaxmpc.model.step_response import StepResponseModel
 from studies.claims import claims
 from studies.evaluate import key_figures
 from studies.extensions import LimitedSteps, limited_steps, time_limit

@@ -1,7 +1,7 @@
 """Real-time optimisation above the controller (thesis 6.7): low demands with and without it, from nothing to results.
 
 Some demanded rates can only be met with a little lift, 0 to 2000 m3/h, where a well slugs. `run_rto` lets the same
-mixed-integer controller follow the demands as they are, and follow what `jaxmpc.rto` makes of them: rates within the
+mixed-integer controller follow the demands as they are, and follow what `steady.optimise` makes of them: rates within the
 demands' deadzones that need no such lift, and the choke and lift that belong to them as input targets (6.20).
 `figures.rto` draws the results.
 """
@@ -19,14 +19,14 @@ import xarray as xr
 
 from identify.steady_map import steady_map
 from identify.step_test import identify_step_response
-from jaxmpc.closed_loop import simulate
+from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.controller.targets import TargetController, simulate_with_targets
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
-from jaxmpc.mixed_integer import MixedIntegerController
-from jaxmpc.reference import Reference
-from jaxmpc.rto import LIFT_RANGES, Targets, optimise
-from jaxmpc.steady_map import SteadyMap
-from jaxmpc.targets import TargetController, simulate_with_targets
+from jaxmpc.loop.reference import Reference
+from jaxmpc.loop.simulate import simulate
+from jaxmpc.steady.map import SteadyMap
+from jaxmpc.steady.optimise import LIFT_RANGES, Targets, optimise
 from studies import presets
 from studies.comparison import closing, progress_bar
 from studies.definition import PLANTS, PlantKind
@@ -116,7 +116,10 @@ def run_rto(
                 f"with {each.mv[0]:.0f} % choke and {each.mv[1]:.0f} m3/h lift. {each.message}"
             )
         code = {package: source_hash(package) for package in ("jaxmpc", "identify")}
-        code |= {name: module_hash(name) for name in ("jaxmpc.rto", "jaxmpc.rto_milp", "jaxmpc.steady_map")}
+        code |= {
+            name: module_hash(name)
+            for name in ("jaxmpc.steady.optimise", "jaxmpc.steady.milp", "jaxmpc.steady.map")
+        }
         inputs = {
             "plant": facts,
             "model": np.asarray(model.coefficients),

@@ -25,7 +25,7 @@ import xarray as xr
 import zarr
 
 from jaxmpc.errors import InputError
-from jaxmpc.trajectory import Trajectory
+from jaxmpc.loop.trajectory import Trajectory
 from studies.sweep import records
 from studies.sweep.records import DamagedError
 

@@ -19,8 +19,8 @@ from identify.schedule import identify_schedule
 from identify.step_test import identify_step_response, settling_notes
 from identify.sweep import steady_sweep
 from jaxmpc.errors import InputError
-from jaxmpc.plant import WellPlant
-from jaxmpc.well import well_hash
+from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.equations import well_hash
 from studies import references
 from studies.comparison import run_comparison
 from studies.definition import (

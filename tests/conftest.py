@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 import jaxmpc  # noqa: F401
-from jaxmpc.step_response import make_model
-from jaxmpc.structure import Structure
-from jaxmpc.tuning import make_tuning
+from jaxmpc.model.step_response import make_model
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import make_tuning
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -4,11 +4,11 @@ import dataclasses
 
 import numpy as np
 
-from jaxmpc.controller import ContinuousController
-from jaxmpc.gain_schedule import ScheduledController, ScheduledMixedIntegerController, make_schedule
-from jaxmpc.mixed_integer import MixedIntegerController
-from jaxmpc.targets import TargetController
-from jaxmpc.tuning import make_tuning
+from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.controller.schedule import ScheduledController, ScheduledMixedIntegerController, make_schedule
+from jaxmpc.controller.targets import TargetController
+from jaxmpc.problem.tuning import make_tuning
 
 START = np.array([11000.0, 185.0]), np.array([50.0, 7500.0])
 SETPOINT = np.array([12500.0, 205.0])

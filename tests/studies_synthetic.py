@@ -3,8 +3,8 @@
 import numpy as np
 import xarray as xr
 
-from jaxmpc.step_response import make_model
-from jaxmpc.trajectory import Trajectory
+from jaxmpc.loop.trajectory import Trajectory
+from jaxmpc.model.step_response import make_model
 from studies.comparison import comparison_template
 from studies.definition import ComparisonDefinition, ReferenceDefinition
 from studies.thesis import CONTROLLERS

@@ -166,7 +166,7 @@ def preparation(hazard: str, index: int, folder):
 def main() -> None:
     """Run the command line with a hazard; figures are left out."""
     import figures.sweep
-    from jaxmpc import cli
+    from jaxmpc.cli import main as cli
     from studies.sweep import runner
 
     program, hazard, index, folder, *arguments = sys.argv

@@ -14,10 +14,10 @@ MAY_IMPORT = {
     "studies": {"studies", "identify", "jaxmpc"},
     "figures": {"figures", "studies", "jaxmpc"},
 }
-COMPOSITION_ROOT = "jaxmpc/cli.py"
+COMPOSITION_ROOT = "jaxmpc/cli/main.py"
 APPS = "studies/notebooks/"  # what a user opens and edits: puts studies and figures together
 DOORS = {
-    "highspy": ("jaxmpc/highs.py",),
+    "highspy": ("jaxmpc/integer/highs.py",),
     "fmpy": ("identify/fmu.py", "identify/fmu_worker.py"),
     "matplotlib": ("figures/",),
     "dask": ("studies/",),
@@ -36,19 +36,16 @@ TEST_ONLY = {
     "tests",
 }
 SOLVES = {  # figures read results: nothing that predicts, solves or simulates
-    f"jaxmpc.{name}"
-    for name in (
-        "condense",
-        "qp",
-        "integer",
-        "highs",
-        "plan",
-        "controller",
-        "plant",
-        "closed_loop",
-        "rto",
-        "step_response",
-    )
+    "jaxmpc.model",
+    "jaxmpc.problem.condense",
+    "jaxmpc.relaxed",
+    "jaxmpc.integer",
+    "jaxmpc.controller.plan",
+    "jaxmpc.controller.continuous",
+    "jaxmpc.controller.mixed_integer",
+    "jaxmpc.process.plant",
+    "jaxmpc.loop.simulate",
+    "jaxmpc.steady.optimise",
 }
 
 
@@ -148,8 +145,8 @@ def test_the_command_line_imports_nothing_heavy_before_a_command_asks_for_it():
         "shlex",
     }
     light |= {"sys", "typing"}
-    own = ("jaxmpc.errors.", "jaxmpc.files.", "jaxmpc.interrupts", "jaxmpc.options.")
-    for path in (ROOT / COMPOSITION_ROOT, ROOT / "jaxmpc/options.py"):
+    own = ("jaxmpc.errors.", "jaxmpc.files.", "jaxmpc.programs.interrupts", "jaxmpc.cli.options.")
+    for path in (ROOT / COMPOSITION_ROOT, ROOT / "jaxmpc/cli/options.py"):
         for name, on_import in imports(path):
             assert not on_import or name.split(".")[0] in light or name.startswith(own), name
 

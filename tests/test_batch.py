@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmpc.batch import (
+from jaxmpc.controller.batch import (
     Lanes,
     build_lanes,
     controller_batch,
@@ -18,9 +18,9 @@ from jaxmpc.batch import (
     place,
     variant_mesh,
 )
-from jaxmpc.controller import ContinuousController
+from jaxmpc.controller.continuous import ContinuousController
 from jaxmpc.errors import InputError
-from jaxmpc.tuning import make_tuning, stack_tunings
+from jaxmpc.problem.tuning import make_tuning, stack_tunings
 
 
 @pytest.fixture(scope="module")

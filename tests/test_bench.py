@@ -8,10 +8,10 @@ import pytest
 
 from figures.benchmark import draw_benchmark
 from identify.step_test import identify_step_response
-from jaxmpc import cli
+from jaxmpc.cli import main as cli
+from jaxmpc.cli.options import parser as make_parser
 from jaxmpc.errors import InputError
-from jaxmpc.options import parser as make_parser
-from jaxmpc.reference import Reference
+from jaxmpc.loop.reference import Reference
 from studies.bench import forms, instances, peers, rows, run
 from studies.bench.context import Context, Size
 from studies.bench.instances import Recordings, replay

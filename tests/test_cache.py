@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from jaxmpc import cache
-from jaxmpc.cache import cache_folder, read_sealed, sealed
+from jaxmpc.programs import cache
+from jaxmpc.programs.cache import cache_folder, read_sealed, sealed
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="modes and owners are of POSIX")
 
@@ -221,7 +221,7 @@ def in_a_new_process(code: str, **environment: str) -> subprocess.CompletedProce
 
 
 def test_without_a_home_directory_the_cache_is_a_private_folder_and_one_line_says_so(tmp_path):
-    code = "import jaxmpc, jax\nfrom jaxmpc.cache import cache_folder\n"
+    code = "import jaxmpc, jax\nfrom jaxmpc.programs.cache import cache_folder\n"
     code += "print(jax.config.jax_compilation_cache_dir, cache_folder('fmu'))"
     run = in_a_new_process(code, TMPDIR=str(tmp_path))
     assert run.returncode == 0

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxmpc.case import case_to_dict, dump_case, load_case, make_case, plan_to_dict
+from jaxmpc.controller.case import case_to_dict, dump_case, load_case, make_case, plan_to_dict
 from jaxmpc.errors import InputError
 from tests import problems
 

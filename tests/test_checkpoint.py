@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxmpc.checkpoint import load_controller, save_controller
+from jaxmpc.controller.checkpoint import load_controller, save_controller
 from jaxmpc.errors import InputError
 from tests.five_controllers import KINDS, START, Process, closed, controller_of, stepped
 

@@ -11,7 +11,7 @@ import pytest
 
 from figures.registry import FIGURES
 from jaxmpc.errors import InputError
-from jaxmpc.step_response import make_model
+from jaxmpc.model.step_response import make_model
 from studies import catalogue, claims, claims_study, comparison, fingerprint
 from studies.claims import ROWS, record, tables, why
 from studies.definition import ReferenceDefinition
@@ -538,7 +538,7 @@ def test_steps_are_timed_once_and_then_read_from_a_file(tmp_path, monkeypatch):
 
 def test_a_run_is_timed_on_the_host_over_its_first_part(monkeypatch):
     from identify.step_test import identify_step_response
-    from jaxmpc.plant import WellPlant
+    from jaxmpc.process.plant import WellPlant
 
     monkeypatch.setattr(claims_study, "TIMED", 60.0)
     study = catalogue.unblocked(True, "jax")

@@ -9,7 +9,7 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxmpc.cli import main
+from jaxmpc.cli.main import main
 from jaxmpc.errors import InputError, MissingToolError, PlantError
 from tests import oracles, problems
 
@@ -78,7 +78,7 @@ def unsolved(stub):
     def refuse(*_, **__):
         raise AssertionError("the solver was called")
 
-    stub("jaxmpc.plan", solve_plan=refuse)
+    stub("jaxmpc.controller.plan", solve_plan=refuse)
 
 
 # ------------------------------------------------------------------------------------------------------- plan
@@ -136,14 +136,14 @@ def test_an_infeasible_case_has_its_own_exit_status_and_a_plan_that_says_so(writ
     ],
 )
 def test_the_exit_status_tells_how_the_solve_ended(plan, status, write, stub, capsys):
-    stub("jaxmpc.plan", solve_plan=lambda *_, **__: plan)
+    stub("jaxmpc.controller.plan", solve_plan=lambda *_, **__: plan)
     assert main(["plan", write(case_body())]) == status
     assert json.loads(capsys.readouterr().out)["status"] == plan.status
 
 
 def test_the_options_and_limits_of_a_case_reach_the_solver(write, stub, capsys):
     given = {}
-    stub("jaxmpc.plan", solve_plan=lambda *_, **options: given.update(options) or answer())
+    stub("jaxmpc.controller.plan", solve_plan=lambda *_, **options: given.update(options) or answer())
     body = case_body("plausible_start")
     body["limits"] = {"time_s": 2.5, "gap": 1e-3}
     for finish in ("auto", "enumeration", "highs", "branch-and-bound"):
@@ -246,10 +246,10 @@ def test_help_shows_defaults_and_units(arguments, words, capsys):
 
 def test_the_installed_command_plans_and_its_help_loads_no_solver(write):
     code = (
-        "import sys; from jaxmpc.cli import main\n"
+        "import sys; from jaxmpc.cli.main import main\n"
         "try: main(['--help'])\n"
         "except SystemExit: pass\n"
-        "heavy = {'highspy', 'fmpy', 'xarray', 'matplotlib', 'equinox', 'jaxmpc.plan'} & set(sys.modules)\n"
+        "heavy = {'highspy', 'fmpy', 'xarray', 'matplotlib', 'equinox', 'jaxmpc.controller.plan'} & set(sys.modules)\n"
         "sys.exit(str(heavy) if heavy else 0)"
     )
     helped = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -329,7 +329,7 @@ def test_the_thesis_study_gets_its_options_and_bad_ones_are_reported(stub, tmp_p
 
 
 def test_every_study_of_the_catalogue_can_be_named_on_the_command_line():
-    from jaxmpc.options import COMPARISONS
+    from jaxmpc.cli.options import COMPARISONS
     from studies.catalogue import STUDIES
 
     assert set(STUDIES) <= set(COMPARISONS)

@@ -12,17 +12,17 @@ import pytest
 
 from identify.step_test import identify_step_response
 from jaxmpc import status
-from jaxmpc.batch import controller_batch, per_lane
-from jaxmpc.closed_loop import simulate, simulate_batch, simulate_batches
-from jaxmpc.controller import ContinuousController
+from jaxmpc.controller.batch import controller_batch, per_lane
+from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.measurement import MISSING, OUTSIDE, SensorFault, fault_errors
+from jaxmpc.controller.mixed_integer import MixedIntegerController
 from jaxmpc.errors import InputError
-from jaxmpc.host_well import HostWell
-from jaxmpc.measurement import MISSING, OUTSIDE, SensorFault, fault_errors
-from jaxmpc.mixed_integer import MixedIntegerController
-from jaxmpc.noise import noise_samples
-from jaxmpc.plant import WellPlant
-from jaxmpc.reference import Reference
-from jaxmpc.well import WellParameters
+from jaxmpc.loop.noise import noise_samples
+from jaxmpc.loop.reference import Reference
+from jaxmpc.loop.simulate import simulate, simulate_batch, simulate_batches
+from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.equations import WellParameters
+from jaxmpc.process.well.host import HostWell
 from studies import presets
 
 TO_30_PERCENT = Reference([0.0, 200.0], [[11013.0, 185.0], [12600.0, 175.0]], 1200.0)
@@ -150,7 +150,7 @@ def test_neither_pieces_of_lanes_nor_of_samples_nor_padding_change_results(lanes
     pieces = run(lanes_at_once=2)
     assert [list(piece.lanes) for piece in pieces] == [[0, 1], [2, 3], [4]]
     in_pieces = whole(pieces)  # the third piece was half copies
-    monkeypatch.setattr("jaxmpc.compiled_loop.CHUNK", 9)
+    monkeypatch.setattr("jaxmpc.loop.compiled.CHUNK", 9)
     in_time = whole(run())  # two samples too many
     for name in at_once:
         if name in ("nodes", "gap", "bound", "solve_time"):
@@ -231,8 +231,8 @@ import sys
 import jax
 import numpy as np
 from jaxmpc import Reference, StepResponseModel, WellPlant
-from jaxmpc.batch import controller_batch
-from jaxmpc.closed_loop import simulate_batches
+from jaxmpc.controller.batch import controller_batch
+from jaxmpc.loop.simulate import simulate_batches
 from studies import presets
 assert jax.device_count() == 4
 structure = presets.structure()

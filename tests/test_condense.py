@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmpc.blocking import (
+from jaxmpc.errors import InputError
+from jaxmpc.problem.blocking import (
     hard_rows,
     oscillation_rows,
     position_rows,
@@ -13,11 +14,10 @@ from jaxmpc.blocking import (
     single_step_blocks,
     window_rows,
 )
-from jaxmpc.condense import condense, dynamic_matrix, make_instance
-from jaxmpc.errors import InputError
-from jaxmpc.relaxed_problem import evaluate
-from jaxmpc.structure import Structure
-from jaxmpc.tuning import make_tuning
+from jaxmpc.problem.condense import condense, dynamic_matrix, make_instance
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import make_tuning
+from jaxmpc.relaxed.problem import evaluate
 
 BLOCKS = (1, 1, 2, 3, 5)
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from jaxmpc import status
-from jaxmpc.controller import ContinuousController, shift_plan
-from jaxmpc.disturbance import filter_bias
+from jaxmpc.controller.bias import filter_bias
+from jaxmpc.controller.continuous import ContinuousController, shift_plan
+from jaxmpc.controller.mixed_integer import MixedIntegerController
 from jaxmpc.errors import InputError
-from jaxmpc.mixed_integer import MixedIntegerController
-from jaxmpc.step_response import make_model
-from jaxmpc.structure import Structure
-from jaxmpc.tuning import make_tuning
+from jaxmpc.model.step_response import make_model
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import make_tuning
 
 START = np.array([11000.0, 185.0]), np.array([50.0, 7500.0])
 

@@ -18,7 +18,7 @@ import pytest
 
 import jaxmpc
 from figures.registry import FIGURES
-from jaxmpc import cli
+from jaxmpc.cli import main as cli
 from studies import catalogue
 from studies.sweep.definition import StudyDefinition, shipped_studies
 

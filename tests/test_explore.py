@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from figures import explore as draw
-from jaxmpc import cli
+from jaxmpc.cli import main as cli
 from jaxmpc.errors import InputError, MissingToolError
 from studies import explore
 from studies.explore import RUN, Settings, main, run, shown_figures, written

@@ -11,11 +11,11 @@ from figures.extensions import ENTRIES
 from identify.schedule import both_ways, identify_schedule
 from identify.step_test import identify_step_response
 from jaxmpc import status
-from jaxmpc.controller import ContinuousController
+from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.mixed_integer import MixedIntegerController
 from jaxmpc.errors import InputError
-from jaxmpc.mixed_integer import MixedIntegerController
-from jaxmpc.plant import WellPlant
-from jaxmpc.tuning import make_tuning
+from jaxmpc.problem.tuning import make_tuning
+from jaxmpc.process.plant import WellPlant
 from studies import catalogue, comparison, extensions, presets, report
 from studies.definition import ComparisonDefinition, ControllerDefinition, ReferenceDefinition
 from studies.store import open_results

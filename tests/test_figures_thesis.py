@@ -11,7 +11,7 @@ import pytest
 from figures import events, gallery, integer_example, plans, produce, registry, soft, style
 from figures.scenario_entries import ENTRIES as SCENARIOS
 from jaxmpc.errors import InputError
-from jaxmpc.trajectory import Trajectory
+from jaxmpc.loop.trajectory import Trajectory
 from studies import catalogue, comparison
 from studies import integer_example as example
 from studies.comparison import comparison_template

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxmpc.cli import main
+from jaxmpc.cli.main import main
 from tests import problems
 
 COMMAND = [sys.executable, "-m", "jaxmpc.cli"]
@@ -40,7 +40,7 @@ def case(tmp_path) -> Path:
 @pytest.fixture
 def unsolved(monkeypatch):
     """A solver that must not be called."""
-    from jaxmpc import plan
+    from jaxmpc.controller import plan
 
     monkeypatch.setattr(plan, "solve_plan", lambda *_, **__: pytest.fail("the solver was called"))
 
@@ -112,7 +112,7 @@ def test_every_command_refuses_a_file_that_nobody_may_write(option, tmp_path, ca
 
 def test_a_fit_does_not_overwrite_what_it_reads(tmp_path, capsys):
     from identify.fit import main as fit
-    from jaxmpc.well import WellParameters, save_parameters
+    from jaxmpc.process.well.equations import WellParameters, save_parameters
     from tests.conftest import second_order
 
     data, prior = tmp_path / "data.json", tmp_path / "prior.json"
@@ -189,7 +189,7 @@ def test_a_name_that_the_terminal_cannot_show_is_printed_in_escapes(tmp_path):
 
 def test_the_solver_of_milps_prints_nothing_into_an_answer():
     code = (
-        "from jaxmpc.highs import solve_milp\nimport numpy as np\n"
+        "from jaxmpc.integer.highs import solve_milp\nimport numpy as np\n"
         "one = np.ones(1)\n"
         "print(solve_milp(one, ([0], [0], [1.0]), one, 3 * one, 0 * one, 5 * one, one > 0)[0])"
     )
@@ -201,7 +201,7 @@ def test_memory_that_the_system_does_not_give_ends_with_one_line(case, monkeypat
     def greedy(*_):
         return np.zeros(2**58)
 
-    monkeypatch.setattr("jaxmpc.case.load_case", greedy)
+    monkeypatch.setattr("jaxmpc.controller.case.load_case", greedy)
     assert main(["plan", str(case)]) == 1
     said = capsys.readouterr().err
     assert said.startswith("jaxmpc: not enough memory: Unable to allocate")
@@ -209,7 +209,7 @@ def test_memory_that_the_system_does_not_give_ends_with_one_line(case, monkeypat
 
 
 def test_a_fault_of_the_program_is_not_hidden(case, monkeypatch):
-    monkeypatch.setattr("jaxmpc.case.load_case", lambda _: 1 / 0)
+    monkeypatch.setattr("jaxmpc.controller.case.load_case", lambda _: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         main(["plan", str(case)])
 
@@ -275,7 +275,7 @@ def test_a_file_that_is_no_text_of_its_kind_ends_with_one_line(words, content, t
 
 
 def test_a_case_file_without_an_end_is_not_read_into_memory(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("jaxmpc.case.LARGEST_FILE", 2**20)
+    monkeypatch.setattr("jaxmpc.controller.case.LARGEST_FILE", 2**20)
     path = tmp_path / "case.json"
     path.write_bytes(b" " * (2**20 + 1))
     assert main(["plan", str(path)]) == 2
@@ -309,7 +309,7 @@ def test_a_platform_that_is_not_there_is_refused_with_those_that_are(variable, p
 def test_help_needs_no_home_directory(tmp_path):
     code = (
         "import pwd\ndef none(*_): raise KeyError('no entry')\npwd.getpwuid = none\n"
-        "import sys\nfrom jaxmpc.cli import main\nsys.exit(main(['--help']))"
+        "import sys\nfrom jaxmpc.cli.main import main\nsys.exit(main(['--help']))"
     )
     environment = {k: v for k, v in os.environ.items() if k not in ("HOME", "JAXMPC_CACHE")}
     run = subprocess.run(

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 from jaxmpc import status
-from jaxmpc.batch import build_lanes
-from jaxmpc.controller import ContinuousController
-from jaxmpc.errors import InputError
-from jaxmpc.gain_schedule import (
+from jaxmpc.controller.batch import build_lanes
+from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.controller.schedule import (
     ModelSchedule,
     ScheduledController,
     ScheduledMixedIntegerController,
     make_schedule,
 )
-from jaxmpc.mixed_integer import MixedIntegerController
-from jaxmpc.tuning import make_tuning, stack_tunings
+from jaxmpc.errors import InputError
+from jaxmpc.problem.tuning import make_tuning, stack_tunings
 
 CHOKES, LIFTS = (10.0, 30.0, 50.0), (5000.0, 7500.0)
 AT = np.array([11000.0, 185.0]), np.array([50.0, 7500.0])  # CVs, MVs

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmpc.gap import FINEST, SMALLEST, closes, relative_gap
+from jaxmpc.relaxed.gap import FINEST, SMALLEST, closes, relative_gap
 
 CASES = [  # value, bound, scale, gap, closed
     (100.0, 99.99995, 1.0, 1e-6, True),

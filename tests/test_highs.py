@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from jaxmpc.highs import ReducedMilp, solve_milp
-from jaxmpc.propagation import Chain
+from jaxmpc.integer.feasible import Chain
+from jaxmpc.integer.highs import ReducedMilp, solve_milp
 
 
 def test_a_linear_programme_with_one_whole_variable_is_solved_to_its_optimum():

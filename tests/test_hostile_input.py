@@ -14,16 +14,16 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from jaxmpc import levelset
-from jaxmpc.case import make_case
-from jaxmpc.cli import main
+from jaxmpc.cli.main import main
+from jaxmpc.controller.case import make_case
 from jaxmpc.errors import InputError
-from jaxmpc.integer import FINISHES
-from jaxmpc.levelset import LowerModel, enumerate_below
-from jaxmpc.memory import BUDGET, check_ranges, check_size
-from jaxmpc.outer_approximation import outer_approximation
-from jaxmpc.propagation import Chain, UndecidedError, nearest
-from jaxmpc.structure import LARGEST, Structure
+from jaxmpc.integer import lower_bound as levelset
+from jaxmpc.integer.feasible import Chain, UndecidedError, nearest
+from jaxmpc.integer.lower_bound import LowerModel, enumerate_below
+from jaxmpc.integer.outer_approximation import outer_approximation
+from jaxmpc.integer.solve import FINISHES
+from jaxmpc.problem.memory import BUDGET, check_ranges, check_size
+from jaxmpc.problem.structure import LARGEST, Structure
 from tests import problems
 
 MOST_MEMORY = 2 * 2**30  # bytes that the process may grow by, compiled programs included

@@ -12,9 +12,9 @@ from identify.fmu import FmuPlant
 from identify.step_test import identify_step_response, settling, settling_notes
 from identify.sweep import stability_map, steady_sweep
 from jaxmpc.errors import InputError, MissingToolError
-from jaxmpc.plant import WellPlant
-from jaxmpc.step_response import StepResponseModel
-from jaxmpc.well import WellParameters, load_parameters, parameters_to_dict
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.equations import WellParameters, load_parameters, parameters_to_dict
 
 DATA = Path(__file__).parents[1].parent / "shared" / "data" / "single_well_step_response.json"
 

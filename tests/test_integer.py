@@ -7,17 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmpc import compiled_lists, compiled_search, status
-from jaxmpc.compiled_lists import Tables
-from jaxmpc.condense import condense, make_instance
-from jaxmpc.constants import Constants
-from jaxmpc.cuts import Cuts
-from jaxmpc.integer import FINISHES, solve_integer, solve_integers
-from jaxmpc.levelset import enumerate_below, exclude
-from jaxmpc.propagation import Chain, nearest, propagate, satisfied
-from jaxmpc.relaxer import Relaxer
-from jaxmpc.scheduling import run
-from jaxmpc.search import Search
+from jaxmpc import status
+from jaxmpc.integer import listing as compiled_lists
+from jaxmpc.integer import search as compiled_search
+from jaxmpc.integer.constants import Constants
+from jaxmpc.integer.cuts import Cuts
+from jaxmpc.integer.feasible import Chain, nearest, propagate, satisfied
+from jaxmpc.integer.host_search import Search
+from jaxmpc.integer.listing import Tables
+from jaxmpc.integer.lower_bound import enumerate_below, exclude
+from jaxmpc.integer.relaxer import Relaxer
+from jaxmpc.integer.scheduling import run
+from jaxmpc.integer.solve import FINISHES, solve_integer, solve_integers
+from jaxmpc.problem.condense import condense, make_instance
 
 NONE = np.zeros((0, 4)), np.zeros(0), np.zeros(0)
 

@@ -95,7 +95,7 @@ def test_ctrl_c_during_a_first_compilation_ends_with_one_line_and_no_crash(momen
 COMMAND = """
 import functools, hashlib, os, signal, sys, threading, time
 sys.argv = ["jaxmpc"]
-from jaxmpc import interrupts
+from jaxmpc.programs import interrupts
 folder = {folder!r}
 def interrupt():
     os.kill(os.getpid(), signal.SIGINT)
@@ -196,7 +196,7 @@ def test_a_command_that_is_done_has_its_own_status_and_what_is_registered_for_th
 def test_a_program_that_uses_the_library_hears_of_ctrl_c_as_ever(tmp_path):
     script = """
         import os, signal, jaxmpc
-        from jaxmpc import cli
+        from jaxmpc.cli import main as cli
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
         try:
             os.kill(os.getpid(), signal.SIGINT)
@@ -218,7 +218,7 @@ def test_ctrl_c_that_is_ignored_stays_ignored(tmp_path):
 
 
 def test_every_command_is_stopped_in_the_same_way_where_it_is_called(monkeypatch, capsys, tmp_path):
-    from jaxmpc import cli
+    from jaxmpc.cli import main as cli
 
     def stop(options):
         raise KeyboardInterrupt("2 of 3 chunks are stored.")
@@ -229,7 +229,7 @@ def test_every_command_is_stopped_in_the_same_way_where_it_is_called(monkeypatch
 
 
 def test_a_benchmark_that_is_stopped_prints_what_it_has(monkeypatch, capsys, tmp_path):
-    from jaxmpc import cli
+    from jaxmpc.cli import main as cli
     from studies.bench import rows, run
 
     def stopped(context):

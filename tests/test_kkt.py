@@ -12,12 +12,12 @@ import pytest
 import scipy.sparse as sp
 
 from jaxmpc import status
-from jaxmpc.blocking import hard_rows
-from jaxmpc.case import make_case
-from jaxmpc.condense import condense, make_instance
-from jaxmpc.kkt import KktResiduals, kkt_residuals
-from jaxmpc.relaxation import solve_relaxed
-from jaxmpc.relaxed_problem import QpSolution, evaluate
+from jaxmpc.controller.case import make_case
+from jaxmpc.problem.blocking import hard_rows
+from jaxmpc.problem.condense import condense, make_instance
+from jaxmpc.relaxed.kkt import KktResiduals, kkt_residuals
+from jaxmpc.relaxed.problem import QpSolution, evaluate
+from jaxmpc.relaxed.solve import solve_relaxed
 from tests import problems
 
 FIELDS = tuple(field.name for field in dataclasses.fields(KktResiduals))

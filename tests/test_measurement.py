@@ -8,11 +8,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxmpc.controller.measurement import (
+    FROZEN,
+    GOOD,
+    MISSING,
+    OUTSIDE,
+    SensorFault,
+    Sensors,
+    fault_errors,
+    received,
+)
+from jaxmpc.controller.mixed_integer import MixedIntegerControllers
 from jaxmpc.errors import InputError
-from jaxmpc.measurement import FROZEN, GOOD, MISSING, OUTSIDE, SensorFault, Sensors, fault_errors, received
-from jaxmpc.mixed_integer import MixedIntegerControllers
-from jaxmpc.structure import Structure
-from jaxmpc.tuning import make_tuning
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import make_tuning
 from tests.five_controllers import KINDS, SETPOINT, START, Process, closed, controller_of, stepped, tuned
 
 CHOSEN = {"measurement_low": [0.0, 0.0], "measurement_high": [30000.0, 500.0]}

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from jaxmpc import status
-from jaxmpc.closed_loop import simulate, simulate_batch
+from jaxmpc.controller.mixed_integer import MixedIntegerController, MixedIntegerControllers
 from jaxmpc.errors import InputError
-from jaxmpc.mixed_integer import MixedIntegerController, MixedIntegerControllers
-from jaxmpc.plant import WellPlant
-from jaxmpc.reference import Reference
-from jaxmpc.tuning import make_tuning
+from jaxmpc.loop.reference import Reference
+from jaxmpc.loop.simulate import simulate, simulate_batch
+from jaxmpc.problem.tuning import make_tuning
+from jaxmpc.process.plant import WellPlant
 
 START = np.array([11000.0, 185.0]), np.array([50.0, 7500.0])
 

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.batch import Lanes
-from jaxmpc.newton import WarmStart
-from jaxmpc.packing import Packing, flattened, rebuilt
+from jaxmpc.controller.batch import Lanes
+from jaxmpc.programs.packing import Packing, flattened, rebuilt
+from jaxmpc.relaxed.newton import WarmStart
 
 
 def tree():

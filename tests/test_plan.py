@@ -12,8 +12,8 @@ import json
 import numpy as np
 import pytest
 
-from jaxmpc.case import make_case
-from jaxmpc.plan import solve_plan
+from jaxmpc.controller.case import make_case
+from jaxmpc.controller.plan import solve_plan
 from tests import oracles, problems
 
 FINISHES = ("auto", "enumeration", "highs", "branch-and-bound")

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxmpc.actuator import move_choke, step_choke
 from jaxmpc.errors import InputError
-from jaxmpc.plant import WellPlant, WellState, steady_state
-from jaxmpc.well import SHIPPED_STEADY_STATE, WellParameters
+from jaxmpc.process.actuator import move_choke, step_choke
+from jaxmpc.process.plant import WellPlant, WellState, steady_state
+from jaxmpc.process.well.equations import SHIPPED_STEADY_STATE, WellParameters
 
 PLANT = WellPlant()
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxmpc.controller import ContinuousController
+from jaxmpc.controller.continuous import ContinuousController
 from tests.five_controllers import KINDS, SETPOINT, START, Process, closed, stepped, tuned
 
 FAR = np.array([14000.0, 230.0])

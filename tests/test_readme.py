@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 import jaxmpc
-from jaxmpc import cli
-from jaxmpc.options import parser as make_parser
+from jaxmpc.cli import main as cli
+from jaxmpc.cli.options import parser as make_parser
 from studies.sweep.definition import StudyDefinition
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -99,5 +99,5 @@ def test_every_public_name_of_the_package_can_be_taken_from_it():
 
 def test_editors_see_every_public_name_of_the_package():
     stub = (ROOT / "jaxmpc" / "__init__.pyi").read_text()
-    lines = re.findall(r"^from jaxmpc\.(\w+) import (\w+) as (\w+)$", stub, re.MULTILINE)
+    lines = re.findall(r"^from jaxmpc\.([\w.]+) import (\w+) as (\w+)$", stub, re.MULTILINE)
     assert {name: home for home, name, same in lines if same == name} == jaxmpc._HOME_OF

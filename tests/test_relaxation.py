@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from jaxmpc import status
-from jaxmpc.blocking import hard_rows
-from jaxmpc.condense import condense, make_instance
-from jaxmpc.newton import WarmStart, refine, warm_start_of
-from jaxmpc.qp import solve
-from jaxmpc.relaxation import cold_start, solve_relaxed, solve_together
-from jaxmpc.relaxed_problem import evaluate, prepare
-from jaxmpc.tuning import make_tuning
+from jaxmpc.problem.blocking import hard_rows
+from jaxmpc.problem.condense import condense, make_instance
+from jaxmpc.problem.tuning import make_tuning
+from jaxmpc.relaxed.interior_point import solve
+from jaxmpc.relaxed.newton import WarmStart, refine, warm_start_of
+from jaxmpc.relaxed.problem import evaluate, prepare
+from jaxmpc.relaxed.solve import cold_start, solve_relaxed, solve_together
 
 LANES = 16
 
@@ -183,7 +183,7 @@ def test_a_lane_of_a_large_batch_does_not_depend_on_its_neighbours(mixed, mixed_
 def test_lanes_in_lockstep_find_what_single_lanes_find(width, mixed, mixed_solved, monkeypatch):
     """What an accelerator runs: all at once, or a few at a time that make room for others."""
     _, qp, rows, lanes = mixed
-    monkeypatch.setattr("jaxmpc.relaxation.WIDTH", width)
+    monkeypatch.setattr("jaxmpc.relaxed.solve.WIDTH", width)
     given = qp, jnp.asarray(rows), lanes, lanes.lower, lanes.upper
     all_of = lambda tree, flag: jax.tree.map(lambda _: flag, tree)  # noqa: E731
     own = *all_of(given[:2], False), *all_of(given[2:], True)

@@ -12,8 +12,8 @@ import figures.rto
 from identify.steady_map import steady_map
 from identify.sweep import steady_sweep
 from jaxmpc.errors import InputError
-from jaxmpc.rto import optimise
-from jaxmpc.steady_map import SteadyMap
+from jaxmpc.steady.map import SteadyMap
+from jaxmpc.steady.optimise import optimise
 from studies.rto import PRICES, demands, run_rto, targets_of
 from studies.store import open_results
 

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmpc.controller import ContinuousController
+from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.mixed_integer import MixedIntegerController, MixedIntegerControllers
+from jaxmpc.controller.plan import Planner
 from jaxmpc.errors import InputError
-from jaxmpc.mixed_integer import MixedIntegerController, MixedIntegerControllers
-from jaxmpc.plan import Planner
 from tests.five_controllers import KINDS, SETPOINT, START, stepped, tuned
 
 

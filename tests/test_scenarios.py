@@ -8,13 +8,13 @@ import pytest
 import xarray as xr
 
 from identify.step_test import identify_step_response
-from jaxmpc.closed_loop import simulate
-from jaxmpc.condense import dynamic_matrix
-from jaxmpc.controller import ContinuousController
+from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.mixed_integer import MixedIntegerController
 from jaxmpc.errors import InputError
-from jaxmpc.mixed_integer import MixedIntegerController
-from jaxmpc.plant import WellPlant
-from jaxmpc.reference import Reference
+from jaxmpc.loop.reference import Reference
+from jaxmpc.loop.simulate import simulate
+from jaxmpc.problem.condense import dynamic_matrix
+from jaxmpc.process.plant import WellPlant
 from studies import catalogue, comparison, definition, plans, presets
 from studies.store import ResultStore, open_results, provenance
 from tests import studies_synthetic as made

@@ -11,11 +11,11 @@ import pytest
 
 import figures
 from jaxmpc import html
+from jaxmpc.controller.plan import Plan
 from jaxmpc.errors import InputError
-from jaxmpc.plan import Plan
-from jaxmpc.step_response import make_model
-from jaxmpc.trajectory import Trajectory
-from jaxmpc.tuning import make_tuning, stack_tunings
+from jaxmpc.loop.trajectory import Trajectory
+from jaxmpc.model.step_response import make_model
+from jaxmpc.problem.tuning import make_tuning, stack_tunings
 
 HOSTILE = '<script>alert("1")</script>&'
 VOID = {"line", "path", "br", "img"}

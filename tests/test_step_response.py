@@ -5,7 +5,12 @@ import numpy as np
 import pytest
 
 from jaxmpc.errors import InputError
-from jaxmpc.step_response import StepResponseModel, advance_free_response, make_model, shift_free_response
+from jaxmpc.model.step_response import (
+    StepResponseModel,
+    advance_free_response,
+    make_model,
+    shift_free_response,
+)
 
 
 def random_model(rng, cv=2, mv=2, samples=30):

@@ -4,12 +4,15 @@ import numpy as np
 import pytest
 
 from identify.step_test import identify_step_response
-from jaxmpc import closed_loop, measurement, status, strides
-from jaxmpc.closed_loop import simulate, simulate_batch
-from jaxmpc.mixed_integer import MixedIntegerController, MixedIntegerControllers
-from jaxmpc.plant import WellPlant
-from jaxmpc.reference import Reference
-from jaxmpc.trajectory import RECORDABLE
+from jaxmpc import status
+from jaxmpc.controller import measurement
+from jaxmpc.controller.mixed_integer import MixedIntegerController, MixedIntegerControllers
+from jaxmpc.loop import simulate as closed_loop
+from jaxmpc.loop import strides
+from jaxmpc.loop.reference import Reference
+from jaxmpc.loop.simulate import simulate, simulate_batch
+from jaxmpc.loop.trajectory import RECORDABLE
+from jaxmpc.process.plant import WellPlant
 from studies import presets
 
 SAMPLES = 90  # more than two calls of the longest length

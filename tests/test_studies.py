@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxmpc.errors import InputError
-from jaxmpc.reference import Reference
+from jaxmpc.loop.reference import Reference
 from studies import claims, comparison, evaluate, fingerprint, presets, references, report, thesis
 from studies.definition import ControllerDefinition, ReferenceDefinition
 from studies.store import ResultStore, open_results

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxmpc.cli import main
-from jaxmpc.options import COMPARISONS
+from jaxmpc.cli.main import main
+from jaxmpc.cli.options import COMPARISONS
 from studies.sweep import runner
 from studies.sweep.chunk import study_layout
 from studies.sweep.definition import shipped_studies

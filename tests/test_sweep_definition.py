@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxmpc.errors import InputError
-from jaxmpc.well import WellParameters
+from jaxmpc.process.well.equations import WellParameters
 from studies import fingerprint, presets, references
 from studies.sweep.definition import StudyDefinition, load_definition, shipped_studies
 from studies.sweep.estimate import MODEL_SECONDS

@@ -9,8 +9,8 @@ import pytest
 
 from jaxmpc import status as codes
 from jaxmpc.errors import InputError
-from jaxmpc.trajectory import TrajectoryBatch
-from jaxmpc.tuning import make_tuning, stack_tunings
+from jaxmpc.loop.trajectory import TrajectoryBatch
+from jaxmpc.problem.tuning import make_tuning, stack_tunings
 from studies import evaluate, presets
 from studies.store import ResultStore, open_results
 from studies.sweep.kpis import ALWAYS, KPIS, RECORD, batch_kpis, channels_of, run_kpis, runs_of

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from jaxmpc import simulate, stack_tunings
-from jaxmpc.controller import ContinuousController
+from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.mixed_integer import MixedIntegerController
 from jaxmpc.errors import InputError, MissingToolError
-from jaxmpc.mixed_integer import MixedIntegerController
-from jaxmpc.plant import WellPlant
-from jaxmpc.trajectory import TrajectoryBatch
+from jaxmpc.loop.trajectory import TrajectoryBatch
+from jaxmpc.process.plant import WellPlant
 from studies.store import provenance
 from studies.sweep import runner, scenarios
 from studies.sweep.chunk import SETTLED, prepare_study, run_chunk, run_scenarios, study_layout

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from jaxmpc import status
-from jaxmpc.blocking import sample_moves
-from jaxmpc.controller import ContinuousController
+from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.measurement import SensorFault, fault_errors
+from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.controller.plan import Planner, solve_plan
+from jaxmpc.controller.targets import TargetController, augment, simulate_with_targets
 from jaxmpc.errors import InputError
-from jaxmpc.measurement import SensorFault, fault_errors
-from jaxmpc.mixed_integer import MixedIntegerController
-from jaxmpc.plan import Planner, solve_plan
-from jaxmpc.plant import WellPlant
-from jaxmpc.reference import Reference
-from jaxmpc.step_response import make_model
-from jaxmpc.structure import Structure
-from jaxmpc.targets import TargetController, augment, simulate_with_targets
-from jaxmpc.tuning import make_tuning, stack_tunings
+from jaxmpc.loop.reference import Reference
+from jaxmpc.model.step_response import make_model
+from jaxmpc.problem.blocking import sample_moves
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import make_tuning, stack_tunings
+from jaxmpc.process.plant import WellPlant
 
 CV, MV = np.array([11000.0, 185.0]), np.array([50.0, 7500.0])
 SETPOINT, TARGET = CV + np.array([-600.0, -3.0]), np.array([46.0, 6900.0])

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from jaxmpc.errors import InputError
-from jaxmpc.plant import JaxOps, rates, steady_state
-from jaxmpc.well import (
+from jaxmpc.process.plant import JaxOps, rates, steady_state
+from jaxmpc.process.well.equations import (
     SHIPPED_STEADY_STATE,
     STATES,
     WellParameters,

@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 
 from identify.step_test import identify_step_response
-from jaxmpc.reference import Reference
-from jaxmpc.step_response import StepResponseModel
+from jaxmpc.loop.reference import Reference
+from jaxmpc.model.step_response import StepResponseModel
 from studies import references
 from studies.bench.instances import MODES, Mode, Recordings
 from studies.bench.judge import LONG, REPEATS

@@ -19,19 +19,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.cache import cache_folder, read_sealed, sealed
-from jaxmpc.case import Case, case_to_dict
-from jaxmpc.closed_loop import simulate
-from jaxmpc.controller import ContinuousController
+from jaxmpc.controller.case import Case, case_to_dict
+from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.mixed_integer import MixedIntegerController
 from jaxmpc.files import write_atomically
-from jaxmpc.mixed_integer import MixedIntegerController
-from jaxmpc.plant import WellPlant
-from jaxmpc.reference import Reference
-from jaxmpc.step_response import StepResponseModel
-from jaxmpc.structure import Structure
-from jaxmpc.trajectory import Trajectory
-from jaxmpc.tuning import Tuning
-from jaxmpc.well import well_hash
+from jaxmpc.loop.reference import Reference
+from jaxmpc.loop.simulate import simulate
+from jaxmpc.loop.trajectory import Trajectory
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import Tuning
+from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.equations import well_hash
+from jaxmpc.programs.cache import cache_folder, read_sealed, sealed
 from studies import presets
 from studies.fingerprint import content_hash
 
@@ -68,7 +68,7 @@ class Recording:
 
 @dataclasses.dataclass(frozen=True)
 class Problems:
-    """Problems of single samples, ``"problem"`` first; values as `jaxmpc.condense.make_instance` takes them."""
+    """Problems of single samples, ``"problem"`` first; values as `jaxmpc.problem.condense.make_instance` takes them."""
 
     free_response: np.ndarray
     setpoint: np.ndarray

@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.blocking import hard_rows
-from jaxmpc.condense import condense, make_instance
-from jaxmpc.newton import warm_start_of
-from jaxmpc.relaxation import cold_start, shifted_start, solve_relaxed
-from jaxmpc.relaxed_problem import QpSolution
+from jaxmpc.problem.blocking import hard_rows
+from jaxmpc.problem.condense import condense, make_instance
+from jaxmpc.relaxed.newton import warm_start_of
+from jaxmpc.relaxed.problem import QpSolution
+from jaxmpc.relaxed.solve import cold_start, shifted_start, solve_relaxed
 from studies.bench.instances import Instances, Problems
 
 

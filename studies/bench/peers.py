@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from jaxmpc.highs import solve_qp as highs_qp
+from jaxmpc.integer.highs import solve_qp as highs_qp
 from studies.bench import forms
 from studies.bench.forms import Form, binaries_of, rows_of, same_matrices
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
-from jaxmpc.interrupts import last_words
+from jaxmpc.programs.interrupts import last_words
 from studies.bench.context import FULL, QUICK, Context, Size
 from studies.bench.peers import MIQP_PEERS, QP_PEERS, Peer
 from studies.bench.rows import Report, Row, table

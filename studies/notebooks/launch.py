@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxmpc.errors import InputError, MissingToolError
-from jaxmpc.interrupts import in_the_end
+from jaxmpc.programs.interrupts import in_the_end
 from studies.notebooks.guard import TOKEN, Guard
 
 APP = Path(__file__).with_name("explore.py")

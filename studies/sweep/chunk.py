@@ -19,15 +19,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.batch import Lanes, controller_batch
-from jaxmpc.closed_loop import simulate_batches
-from jaxmpc.mixed_integer import MixedIntegerControllers
-from jaxmpc.plant import WellPlant
-from jaxmpc.relaxer import forget_programs
-from jaxmpc.step_response import StepResponseModel
-from jaxmpc.trajectory import AXES, TrajectoryBatch
-from jaxmpc.tuning import stack_tunings
-from jaxmpc.well import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS
+from jaxmpc.controller.batch import Lanes, controller_batch
+from jaxmpc.controller.mixed_integer import MixedIntegerControllers
+from jaxmpc.integer.relaxer import forget_programs
+from jaxmpc.loop.simulate import simulate_batches
+from jaxmpc.loop.trajectory import AXES, TrajectoryBatch
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.problem.tuning import stack_tunings
+from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS
 from studies import presets
 from studies.fingerprint import versions
 from studies.store import VARIABLES

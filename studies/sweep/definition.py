@@ -17,9 +17,9 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec import UNSET
 
+from jaxmpc.controller.measurement import FAULTS
 from jaxmpc.errors import InputError
-from jaxmpc.measurement import FAULTS
-from jaxmpc.well import CV_NAMES
+from jaxmpc.process.well.equations import CV_NAMES
 from studies.sweep.fields import FIELDS, near, similar_end
 from studies.sweep.sections import (
     STORABLE,

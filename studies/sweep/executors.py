@@ -21,8 +21,8 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Protocol
 
 from jaxmpc.errors import InputError, MissingToolError
-from jaxmpc.interrupts import held
-from jaxmpc.threads import THREADS, cores
+from jaxmpc.programs.interrupts import held
+from jaxmpc.programs.threads import THREADS, cores
 from studies.sweep.chunk import ChunkResult, PreparedStudy, run_chunk
 from studies.sweep.scenarios import code_hash
 

@@ -15,8 +15,8 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxmpc.errors import InputError
-from jaxmpc.tuning import CV_FIELDS, LIMITS, MV_FIELDS, UNITS
-from jaxmpc.well import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS, WellParameters
+from jaxmpc.problem.tuning import CV_FIELDS, LIMITS, MV_FIELDS, UNITS
+from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS, WellParameters
 from studies import presets, references
 
 LONGEST = 10_000  # samples of a horizon; more would not fit into memory

@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxmpc.controller.measurement import GOOD
 from jaxmpc.errors import InputError
-from jaxmpc.measurement import GOOD
+from jaxmpc.loop.trajectory import TrajectoryBatch
+from jaxmpc.problem.tuning import CV_FIELDS, MV_FIELDS, Tuning
+from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES
 from jaxmpc.status import OPTIMAL
-from jaxmpc.trajectory import TrajectoryBatch
-from jaxmpc.tuning import CV_FIELDS, MV_FIELDS, Tuning
-from jaxmpc.well import CV_NAMES, MV_NAMES
 from studies import kpi, kpi_setpoint
 
 ROUNDING = 1e-6  # of a value at its limit, relative to the distance between the limits
@@ -158,7 +158,7 @@ ALWAYS = (
 
 
 class Run(NamedTuple):
-    """One run as arrays, fields as in `jaxmpc.trajectory.Trajectory`; `runs_of` gives many, lanes first.
+    """One run as arrays, fields as in `jaxmpc.loop.trajectory.Trajectory`; `runs_of` gives many, lanes first.
 
     Attributes:
         cv: ``"sample cv"``, measured by sensors without fault, noise included.
@@ -348,9 +348,9 @@ def batch_kpis(batch: TrajectoryBatch, tunings: Tuning, window, *, tolerance=Non
     Args:
         batch: with at least the fields `RECORD`, from the start of the runs, so that the position before the first
             sample is where the run began.
-        tunings: one per lane of the batch (`jaxmpc.tuning.stack_tunings`), or one for all.
+        tunings: one per lane of the batch (`jaxmpc.problem.tuning.stack_tunings`), or one for all.
         window: labels of the setpoint windows, ``"sample"`` or ``"lane sample"``, such as
-            `jaxmpc.reference.Reference.window` gives.
+            `jaxmpc.loop.reference.Reference.window` gives.
         tolerance: half width around the setpoint in which a CV counts as settled, ``"cv"`` or ``"lane cv"``
             [CV unit]; the deadzone of each lane if not given. Give one where scenarios differ in their deadzone.
 

@@ -8,8 +8,8 @@ import jax
 
 from identify.step_test import identify_step_response
 from jaxmpc.errors import InputError
-from jaxmpc.plant import check_inputs, steady_state
-from jaxmpc.step_response import StepResponseModel
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.process.plant import check_inputs, steady_state
 
 Point = tuple[float, float]
 STEPS = (2.0, 100.0)  # of the choke [%] and of the gas lift [m3/h]

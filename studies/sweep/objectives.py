@@ -18,7 +18,7 @@ import numpy as np
 from msgspec import UNSET
 
 from jaxmpc.errors import InputError
-from jaxmpc.well import CV_NAMES, MV_NAMES
+from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES
 from studies import presets
 from studies.store import provenance
 from studies.sweep.fields import near

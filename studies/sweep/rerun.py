@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from jaxmpc.closed_loop import simulate
-from jaxmpc.controller import ContinuousController
+from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.mixed_integer import MixedIntegerController
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
-from jaxmpc.mixed_integer import MixedIntegerController
-from jaxmpc.plant import WellPlant
-from jaxmpc.trajectory import AXES, Trajectory
+from jaxmpc.loop.simulate import simulate
+from jaxmpc.loop.trajectory import AXES, Trajectory
+from jaxmpc.process.plant import WellPlant
 from studies.store import provenance
 from studies.sweep.chunk import from_strict_json
 from studies.sweep.definition import StudyDefinition

@@ -15,12 +15,12 @@ import numpy as np
 from msgspec import UNSET
 
 from jaxmpc.errors import InputError
-from jaxmpc.noise import check_deviation, check_seed
-from jaxmpc.plant import check_inputs
-from jaxmpc.reference import Reference
-from jaxmpc.structure import Structure
-from jaxmpc.tuning import CV_FIELDS, DEFAULTS, LIMIT_PAIRS, LIMITS, MV_FIELDS, make_tuning
-from jaxmpc.well import CV_NAMES, MV_NAMES, WellParameters, check_parameters
+from jaxmpc.loop.noise import check_deviation, check_seed
+from jaxmpc.loop.reference import Reference
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import CV_FIELDS, DEFAULTS, LIMIT_PAIRS, LIMITS, MV_FIELDS, make_tuning
+from jaxmpc.process.plant import check_inputs
+from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES, WellParameters, check_parameters
 from studies import presets, references
 from studies.sweep.axes import AxisTable
 from studies.sweep.definition import StudyDefinition
@@ -61,8 +61,8 @@ class Inputs:
     Attributes:
         variants: distinct shapes.
         variant: ``"scenario"``, which of them.
-        tuning: per field of `jaxmpc.tuning.Tuning` ``"scenario name"``, and ``"scenario"`` for the bias cut-off.
-        plant: per field of `jaxmpc.well.WellParameters` ``"scenario"``, SI units.
+        tuning: per field of `jaxmpc.problem.tuning.Tuning` ``"scenario name"``, and ``"scenario"`` for the bias cut-off.
+        plant: per field of `jaxmpc.process.well.equations.WellParameters` ``"scenario"``, SI units.
         point: ``"scenario 2"``, working point of the model: choke [%], gas lift [m3/h].
         noise: ``"scenario cv"``, standard deviation [CV unit].
         seed: ``"scenario"``, of the noise.

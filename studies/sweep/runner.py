@@ -15,7 +15,7 @@ from typing import Any
 from tqdm import tqdm
 
 from jaxmpc.errors import InputError
-from jaxmpc.interrupts import last_words
+from jaxmpc.programs.interrupts import last_words
 from studies.sweep.chunk import ChunkResult, PreparedStudy, prepare_study, study_layout
 from studies.sweep.executors import Cluster, Executor, Here, LostError, Processes, connect, disconnect
 from studies.sweep.progress import progress_bar

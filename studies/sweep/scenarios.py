@@ -16,13 +16,13 @@ import numpy as np
 from msgspec import UnsetType
 
 from jaxmpc import html
+from jaxmpc.controller.measurement import SensorFault, fault_errors
 from jaxmpc.errors import InputError
-from jaxmpc.measurement import SensorFault, fault_errors
-from jaxmpc.reference import Reference
-from jaxmpc.structure import Structure
-from jaxmpc.trajectory import AXES
-from jaxmpc.tuning import Tuning, make_tuning
-from jaxmpc.well import CV_NAMES, MV_NAMES, WellParameters
+from jaxmpc.loop.reference import Reference
+from jaxmpc.loop.trajectory import AXES
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import Tuning, make_tuning
+from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES, WellParameters
 from studies import fingerprint
 from studies.sweep import models
 from studies.sweep.axes import AxisTable, expand_axes
@@ -59,7 +59,7 @@ class Scenario:
         noise: standard deviation ``"cv"`` [CV unit]; None without noise.
         seed: of the noise.
         disturbance: offset of the reservoir pressure ``"sample"`` [bar]; None without any.
-        faults: errors of failing sensors ``"sample cv"`` (`jaxmpc.measurement.fault_errors`); None without any.
+        faults: errors of failing sensors ``"sample cv"`` (`jaxmpc.controller.measurement.fault_errors`); None without any.
         position_feedback: whether the controller is told where the actuators stand.
     """
 

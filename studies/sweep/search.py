@@ -18,8 +18,8 @@ import jax
 import numpy as np
 
 from jaxmpc.errors import InputError, MissingToolError
-from jaxmpc.interrupts import last_words
-from jaxmpc.step_response import StepResponseModel
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.programs.interrupts import last_words
 from studies.sweep.chunk import run_scenarios, stored_times
 from studies.sweep.layout import FLAG
 from studies.sweep.models import Point as WorkingPoint

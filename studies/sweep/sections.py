@@ -7,11 +7,11 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import UNSET, UnsetType
 
+from jaxmpc.controller.measurement import FAULTS
 from jaxmpc.errors import InputError
-from jaxmpc.measurement import FAULTS
-from jaxmpc.reference import Reference
-from jaxmpc.trajectory import AXES
-from jaxmpc.well import CV_NAMES
+from jaxmpc.loop.reference import Reference
+from jaxmpc.loop.trajectory import AXES
+from jaxmpc.process.well.equations import CV_NAMES
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 STORABLE = tuple(name for names in AXES.values() for name in names if name != "time")
@@ -111,7 +111,7 @@ class Store(Section, frozen=True):
 
     Attributes:
         every: samples from one stored point of a trajectory to the next.
-        trajectories: which fields of `jaxmpc.trajectory.Trajectory` to keep over time.
+        trajectories: which fields of `jaxmpc.loop.trajectory.Trajectory` to keep over time.
     """
 
     every: Count = 10
@@ -144,7 +144,7 @@ class PressureStep(Section, frozen=True):
 
 
 class FaultSection(Section, frozen=True):
-    """``[[base.sensor_fault]]``: a sensor that fails for a while, as in `jaxmpc.measurement.SensorFault`."""
+    """``[[base.sensor_fault]]``: a sensor that fails for a while, as in `jaxmpc.controller.measurement.SensorFault`."""
 
     cv: Literal[CV_NAMES]  # type: ignore[valid-type]
     kind: Literal[FAULTS]  # type: ignore[valid-type]
@@ -154,7 +154,7 @@ class FaultSection(Section, frozen=True):
 
 
 class InlineReference(Section, frozen=True):
-    """``[base.reference]``: setpoints of the study's own, as in `jaxmpc.reference.Reference`."""
+    """``[base.reference]``: setpoints of the study's own, as in `jaxmpc.loop.reference.Reference`."""
 
     times: tuple[float, ...]
     setpoints: tuple[tuple[float, ...], ...]

@@ -8,10 +8,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.controller import shift_plan
-from jaxmpc.mixed_integer import MixedIntegerController
-from jaxmpc.plan import Plan
-from jaxmpc.relaxation import shifted_start
+from jaxmpc.controller.continuous import shift_plan
+from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.controller.plan import Plan
+from jaxmpc.relaxed.solve import shifted_start
 from studies.bench import forms
 from studies.bench.context import Context, absent, ask, asked
 from studies.bench.instances import Instances, make_controller

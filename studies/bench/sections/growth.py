@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxmpc.step_response import make_model
-from jaxmpc.structure import Structure
-from jaxmpc.tuning import make_tuning
+from jaxmpc.model.step_response import make_model
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import make_tuning
 from studies.bench.context import Context, ask
 from studies.bench.instances import Instances, Problems
 from studies.bench.judge import Judge

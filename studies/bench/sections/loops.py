@@ -7,12 +7,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxmpc.batch import controller_batch
-from jaxmpc.closed_loop import simulate_batch
-from jaxmpc.mixed_integer import MixedIntegerControllers
-from jaxmpc.plant import WellPlant
-from jaxmpc.reference import Reference
-from jaxmpc.tuning import Tuning
+from jaxmpc.controller.batch import controller_batch
+from jaxmpc.controller.mixed_integer import MixedIntegerControllers
+from jaxmpc.loop.reference import Reference
+from jaxmpc.loop.simulate import simulate_batch
+from jaxmpc.problem.tuning import Tuning
+from jaxmpc.process.plant import WellPlant
 from studies import presets, references
 from studies.bench.context import Context
 from studies.bench.instances import Kind, Mode, Recording, make_controller

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxmpc.plan import Planner
+from jaxmpc.controller.plan import Planner
 from studies.bench.context import Context
 from studies.bench.judge import Judge
 from studies.bench.rows import Goal, Row, timed

@@ -1,0 +1,1 @@
+"""Controllers: state, measurement, step, plan, targets (6.20)."""

@@ -1,0 +1,416 @@
+"""One controller step as a file: the case that `jaxmpc plan` reads, and the plan that it writes.
+
+A case holds everything that one optimisation needs (thesis 5.1, 6.1-6.5), in engineering units, as JSON that
+any language can write. Reading is strict: unknown fields, wrong shapes and impossible numbers are refused,
+with the path of the field, before anything is computed. `make_model`, `Structure` and `make_tuning` do the
+checks that are theirs; this file adds what belongs to a single step. The command line, tests and replays of
+logged steps call it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from jaxmpc.errors import InputError
+from jaxmpc.files import write_atomically
+from jaxmpc.model.step_response import StepResponseModel, make_model
+from jaxmpc.problem.condense import DRIFT
+from jaxmpc.problem.structure import LARGEST, Structure, sound
+from jaxmpc.problem.tuning import UNITS, Tuning, make_tuning
+from jaxmpc.relaxed.gap import check_gap, check_time_limit
+
+DEFAULT_GAP = 1e-6
+LARGEST_FILE = 64 * 2**20  # bytes; a hundred thousand samples of four CVs take 10 MiB
+LONGEST_HORIZON = 100_000  # samples; beyond it the file is wrong, and memory runs out before any other check
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Case:
+    """One controller step, checked.
+
+    Attributes:
+        model: step responses.
+        structure: horizons, blocks and integer steps; its names and dt are the model's.
+        tuning: weights and limits.
+        mv_now: ``"mv"``, MVs before the move that is to be decided [MV unit].
+        last_move: ``"mv"``, the move that was applied at the previous sample [MV unit].
+        free_response: ``"horizon cv"``, what the CVs do without further moves, bias included [CV unit].
+        setpoint: ``"horizon cv"`` [CV unit].
+        previous_moves: ``"block mv"``, where the search may start [MV unit per sample], or ``None``.
+        time_limit: of the solve [s], or ``None``.
+        gap: relative gap at which the plan counts as optimal.
+    """
+
+    model: StepResponseModel
+    structure: Structure
+    tuning: Tuning
+    mv_now: np.ndarray
+    last_move: np.ndarray
+    free_response: np.ndarray
+    setpoint: np.ndarray
+    previous_moves: np.ndarray | None = None
+    time_limit: float | None = None
+    gap: float = DEFAULT_GAP
+
+
+class _ModelFields(msgspec.Struct, forbid_unknown_fields=True):
+    dt: float
+    cv: list[str]
+    mv: list[str]
+    coefficients: list[list[list[float]]]
+
+
+class _StructureFields(msgspec.Struct, forbid_unknown_fields=True):
+    prediction_horizon: int
+    control_horizon: int
+    first_penalised: int
+    blocking: str
+    blocks: list[int] = []
+    integer_step: dict[str, Any] = {}
+
+
+class _TuningFields(msgspec.Struct, forbid_unknown_fields=True):
+    cv_weight: list[float]
+    move_weight: list[float]
+    soft_quadratic: list[float]
+    soft_linear: list[float]
+    deadzone: list[float]
+    cv_low: list[float | None]
+    cv_high: list[float | None]
+    slack_weight: list[float]
+    mv_low: list[float | None]
+    mv_high: list[float | None]
+    move_low: list[float | None]
+    move_high: list[float | None]
+    oscillation_rows: dict[str, Any] = {}
+
+
+class _LimitFields(msgspec.Struct, forbid_unknown_fields=True):
+    time_s: float | None = None
+    gap: float = DEFAULT_GAP
+
+
+class _CaseFields(msgspec.Struct, forbid_unknown_fields=True):
+    model: _ModelFields
+    structure: _StructureFields
+    tuning: _TuningFields
+    mv_now: list[float]
+    last_move: list[float]
+    free_response: list[list[float]]
+    setpoint: list[list[float]]
+    previous_moves: list[list[float]] | None = None
+    limits: _LimitFields | None = None
+
+
+class _Nothing:
+    def __repr__(self):
+        return "nothing"
+
+
+_FIELDS = {
+    "": _CaseFields,
+    "model": _ModelFields,
+    "structure": _StructureFields,
+    "tuning": _TuningFields,
+    "limits": _LimitFields,
+}
+_UNIT = {
+    "model.dt": "s",
+    "model.coefficients": "CV unit per MV unit",
+    "structure.prediction_horizon": "samples",
+    "structure.control_horizon": "samples",
+    "structure.first_penalised": "samples",
+    "structure.blocks": "samples",
+    "mv_now": "MV unit",
+    "last_move": "MV unit",
+    "free_response": "CV unit",
+    "setpoint": "CV unit",
+    "previous_moves": "MV unit per sample",
+    "limits.time_s": "s",
+    "limits.gap": "relative",
+    **{f"tuning.{key}": unit for key, unit in UNITS.items()},
+}
+_KIND = {
+    "float": "a number",
+    "float | null": "a number (or null for none)",
+    "int": "a whole number",
+    "str": "text in quotes",
+    "array": "a list",
+    "array | null": "a list",
+    "object": "an object {...}",
+    "object | null": "an object {...}",
+}
+
+
+def load_case(path: str | Path) -> Case:
+    """Read a case file.
+
+    Args:
+        path: JSON file with the fields of `Case`.
+
+    Raises:
+        InputError: for a file that cannot be read, text that is not JSON, and everything `make_case` refuses.
+    """
+    try:
+        with open(path, "rb") as file:
+            text = file.read(LARGEST_FILE + 1)
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError("case file", str(path), f"a readable file ({reason})") from error
+    if len(text) > LARGEST_FILE:
+        raise InputError("case file", str(path), f"a file of {LARGEST_FILE // 2**20} MiB at most")
+    try:
+        body = json.loads(text, object_pairs_hook=_without_repeats)
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:  # bad syntax, bad UTF-8, absurd numbers or nesting
+        raise InputError("case file", str(path), f"a JSON object ({error})") from error
+    return make_case(body)
+
+
+def make_case(body: Any) -> Case:
+    """Check a decoded case file.
+
+    Args:
+        body: nested dictionaries and lists, as JSON decodes them.
+
+    Returns:
+        The case, with infinite limits where the file has null.
+
+    Raises:
+        InputError: naming the path of the field, for unknown or missing fields, wrong types (true and false
+            are not numbers), wrong shapes, NaN, crossed limits, and whatever else makes the step meaningless.
+    """
+    fields = _decode(body)
+    model = make_model(fields.model.coefficients, fields.model.dt, fields.model.cv, fields.model.mv)
+    structure = _structure(fields.structure, model)
+    tuning = make_tuning(structure, **{key: getattr(fields.tuning, key) for key in _names(_TuningFields)})
+    horizon = f"prediction_horizon = {structure.prediction_horizon}"
+    case = Case(
+        model=model,
+        structure=structure,
+        tuning=tuning,
+        mv_now=_row("mv_now", fields.mv_now, model.mv_names),
+        last_move=_row("last_move", fields.last_move, model.mv_names),
+        free_response=_table(
+            "free_response", fields.free_response, structure.prediction_horizon, horizon, model.cv_names
+        ),
+        setpoint=_table("setpoint", fields.setpoint, structure.prediction_horizon, horizon, model.cv_names),
+        previous_moves=None
+        if fields.previous_moves is None
+        else _table(
+            "previous_moves",
+            fields.previous_moves,
+            structure.block_count,
+            f"the number of blocks = {structure.block_count}",
+            model.mv_names,
+        ),
+        **_limits(fields.limits or _LimitFields()),
+    )
+    _check_position(case)
+    return case
+
+
+def case_to_dict(case: Case) -> dict[str, Any]:
+    """The content of the case file that reads back as `case`; infinite limits become ``None``.
+
+    The bias filter and the mean-move limit are the controller's memory, not part of one step: a caller that
+    logs a step passes the move limits that held in that step.
+    """
+    structure, tuning, model = case.structure, case.tuning, case.model
+    body: dict[str, Any] = {
+        "model": {
+            "dt": model.dt,
+            "cv": list(model.cv_names),
+            "mv": list(model.mv_names),
+            "coefficients": np.asarray(model.coefficients).tolist(),
+        },
+        "structure": {
+            "prediction_horizon": structure.prediction_horizon,
+            "control_horizon": structure.control_horizon,
+            "first_penalised": structure.first_penalised,
+            "blocks": list(structure.blocks),
+            "blocking": structure.blocking,
+            "integer_step": {structure.mv_names[i]: structure.integer_step[i] for i in structure.integer_mvs},
+        },
+        "tuning": {
+            key: [
+                value if math.isfinite(value) else None for value in np.asarray(getattr(tuning, key)).tolist()
+            ]
+            for key in _names(_TuningFields)
+            if key != "oscillation_rows"
+        },
+        "mv_now": np.asarray(case.mv_now).tolist(),
+        "last_move": np.asarray(case.last_move).tolist(),
+        "free_response": np.asarray(case.free_response).tolist(),
+        "setpoint": np.asarray(case.setpoint).tolist(),
+    }
+    body["tuning"]["oscillation_rows"] = {
+        structure.mv_names[i]: bool(tuning.oscillation_rows[i]) for i in structure.integer_mvs
+    }
+    if case.previous_moves is not None:
+        body["previous_moves"] = np.asarray(case.previous_moves).tolist()
+    body["limits"] = {"time_s": case.time_limit, "gap": case.gap}
+    return body
+
+
+def dump_case(case: Case, path: str | Path) -> Path:
+    """Write `case` as a case file, in one go; returns the path."""
+    return write_atomically(path, json.dumps(case_to_dict(case), indent=1, allow_nan=False))
+
+
+def plan_to_dict(plan: Any) -> dict[str, Any]:
+    """The content of a plan file: the fields of a `Plan`, with null where a number is not finite."""
+    return {
+        "status": str(plan.status),
+        "objective": _plain(plan.objective),
+        "bound": _plain(plan.bound),
+        "gap": _plain(plan.gap),
+        "moves": _plain(plan.moves),
+        "mv": _plain(plan.mv),
+        "cv": _plain(plan.cv),
+        "eps_high": _plain(plan.eps_high),
+        "eps_low": _plain(plan.eps_low),
+        "nodes": _plain(plan.nodes),
+        "solve_time_s": _plain(plan.solve_time_s),
+        "finished_by": None if plan.finished_by is None else str(plan.finished_by),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Arrays and numbers as JSON values; JSON has no NaN and no infinity."""
+    if value is None or isinstance(value, (int, float)):
+        return value if value is None or math.isfinite(value) else None
+    if isinstance(value, list):
+        return [_plain(entry) for entry in value]
+    return _plain(np.asarray(value).tolist())
+
+
+def _names(fields: type[msgspec.Struct]) -> tuple[str, ...]:
+    return fields.__struct_fields__
+
+
+def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object; a repeated key would silently drop the first value."""
+    body = dict(pairs)
+    if len(body) < len(pairs):
+        keys = [key for key, _ in pairs]
+        repeated = next(key for key in keys if keys.count(key) > 1)
+        raise InputError(repeated, [value for key, value in pairs if key == repeated], "this key once")
+    return body
+
+
+def _decode(body: Any) -> _CaseFields:
+    """The typed fields, or an InputError with the path that msgspec found."""
+    try:
+        return msgspec.convert(body, _CaseFields)
+    except msgspec.ValidationError as error:
+        message, _, where = str(error).partition(" - at `$")
+        path = where.rstrip("`").lstrip(".")
+        value = _at(body, path)
+        if found := re.search(r"unknown field `(.*)`", message):
+            names = _names(_FIELDS[path])
+            raise InputError(
+                _join(path, found[1]), value[found[1]], f"no such field, only {', '.join(names)}"
+            ) from None
+        if found := re.search(r"missing required field `(.*)`", message):
+            expected = f"a value (the field is missing){_unit(_join(path, found[1]))}"
+            raise InputError(_join(path, found[1]), _Nothing(), expected) from None
+        found = re.match(r"Expected `(.*)`, got", message)
+        kind = _KIND.get(found[1], found[1]) if found else f"a finite number ({message})"
+        raise InputError(path or "case", value, kind + _unit(path)) from None
+
+
+def _at(body: Any, path: str) -> Any:
+    """The value at a path such as ``tuning.cv_weight[1]``."""
+    for name, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", path):
+        body = body[name] if name else body[int(index)]
+    return body
+
+
+def _join(path: str, name: str) -> str:
+    name = name or '""'
+    return f"{path}.{name}" if path else name
+
+
+def _unit(path: str) -> str:
+    unit = _UNIT.get(re.sub(r"\[\d+\]", "", path))
+    return f" [{unit}]" if unit else ""
+
+
+def _structure(fields: _StructureFields, model: StepResponseModel) -> Structure:
+    steps: list[Any] = [None] * len(model.mv_names)
+    for name, step in fields.integer_step.items():
+        path = f"structure.integer_step.{name}"
+        if name not in model.mv_names:
+            raise InputError(path, step, f"one of the MV names {', '.join(model.mv_names)}")
+        if step is None:
+            raise InputError(path, step, "a positive step [MV unit]; leave a continuous MV out")
+        steps[model.mv_names.index(name)] = step
+    for key in ("prediction_horizon", "control_horizon"):
+        if getattr(fields, key) > LONGEST_HORIZON:
+            raise InputError(f"structure.{key}", getattr(fields, key), f"at most {LONGEST_HORIZON} samples")
+    return Structure(
+        cv_names=model.cv_names,
+        mv_names=model.mv_names,
+        dt=model.dt,
+        prediction_horizon=fields.prediction_horizon,
+        control_horizon=fields.control_horizon,
+        first_penalised=fields.first_penalised,
+        blocks=tuple(fields.blocks),
+        blocking=fields.blocking,  # type: ignore[arg-type]  # `Structure` checks it
+        integer_step=tuple(steps),
+    )
+
+
+def _row(path: str, given: list[float], names: tuple[str, ...]) -> np.ndarray:
+    """A finite vector with one entry per name."""
+    if len(given) != len(names):
+        raise InputError(path, given, f"{len(names)} numbers{_unit(path)} for {', '.join(names)}")
+    return _finite(path, np.array(given, dtype=np.float64))
+
+
+def _table(path: str, given: list[list[float]], rows: int, why: str, names: tuple[str, ...]) -> np.ndarray:
+    """A finite matrix of exactly `rows` rows with one column per name."""
+    if len(given) != rows:
+        raise InputError(path, f"{len(given)} rows", f"{why} rows of {len(names)} numbers{_unit(path)}")
+    for i, row in enumerate(given):
+        if len(row) != len(names):
+            raise InputError(f"{path}[{i}]", row, f"{len(names)} numbers{_unit(path)} for {', '.join(names)}")
+    return _finite(path, np.array(given, dtype=np.float64))
+
+
+def _finite(path: str, array: np.ndarray) -> np.ndarray:
+    bad = np.argwhere(~sound(array))
+    if len(bad):
+        index = "".join(f"[{i}]" for i in bad[0])
+        expected = f"a finite number of size {LARGEST:g} at most{_unit(path)}"
+        raise InputError(path + index, float(array[tuple(bad[0])]), expected)
+    array.setflags(write=False)
+    return array
+
+
+def _limits(fields: _LimitFields) -> dict[str, Any]:
+    return {
+        "time_limit": check_time_limit("limits.time_s", fields.time_s),
+        "gap": check_gap("limits.gap", fields.gap),
+    }
+
+
+def _check_position(case: Case) -> None:
+    """Refuse MVs outside their limits: the closed-loop controller recovers, a single step cannot."""
+    low, high = np.asarray(case.tuning.mv_low), np.asarray(case.tuning.mv_high)
+    for i, name in enumerate(case.structure.mv_names):
+        now = float(case.mv_now[i])
+        drift = DRIFT * (case.structure.integer_step[i] or max(1.0, abs(now)))  # what MIP solvers leave over
+        if not low[i] - drift <= now <= high[i] + drift:
+            expected = f"mv_low[{i}] = {low[i]:g} to mv_high[{i}] = {high[i]:g} [MV unit] for {name}"
+            raise InputError(f"mv_now[{i}]", now, expected)

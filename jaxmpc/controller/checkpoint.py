@@ -1,0 +1,220 @@
+"""Controllers and their states as files, so that a restarted controller goes on as if it had not been stopped.
+
+A file is JSON that says its version and holds all numbers in full: after `load_controller` every further step is the one
+that would have been made, to the last bit. Reading is as strict as the constructors: nothing that they refuse comes back.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmpc.controller.continuous import ContinuousController, ControllerState
+from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.controller.schedule import ModelSchedule, ScheduledController, ScheduledMixedIntegerController
+from jaxmpc.controller.targets import TargetController
+from jaxmpc.errors import InputError
+from jaxmpc.files import write_atomically
+from jaxmpc.model.step_response import StepResponseModel, make_model
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import CV_FIELDS, Tuning, make_tuning
+
+FORMAT = "jaxmpc/controller/1"
+NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}  # numbers that JSON has no word for
+
+Controller = (
+    ContinuousController
+    | MixedIntegerController
+    | ScheduledController
+    | ScheduledMixedIntegerController
+    | TargetController
+)
+
+
+class _Parts(NamedTuple):
+    """What a controller is made of."""
+
+    kind: str
+    structure: Structure
+    tuning: Tuning
+    model: StepResponseModel | ModelSchedule
+    options: dict[str, Any]
+
+
+def save_controller(controller: Controller, path: str | Path, state: ControllerState | None = None) -> Path:
+    """Write a controller, and the state that it is in, as one file.
+
+    Args:
+        controller: a single one, of any kind.
+        path: the file; replaced in one go.
+        state: from `init` or the last `step`; None for the controller alone.
+
+    Returns:
+        The path written.
+    """
+    parts = _parts(controller)
+    tuning = {field.name: _plain(getattr(parts.tuning, field.name)) for field in dataclasses.fields(Tuning)}
+    body = {
+        "format": FORMAT,
+        "kind": parts.kind,
+        "structure": dataclasses.asdict(parts.structure),
+        "tuning": tuning,
+        "model": parts.model.to_dict(),
+        "options": parts.options,
+        "state": None if state is None else {name: _plain(leaf) for name, leaf in _named(state).items()},
+    }
+    return write_atomically(path, json.dumps(body, allow_nan=False))
+
+
+def load_controller(path: str | Path) -> tuple[Controller, ControllerState | None]:
+    """Read what `save_controller` wrote.
+
+    Args:
+        path: the file.
+
+    Returns:
+        ``(controller, state)``; the state is None if none was saved.
+
+    Raises:
+        InputError: naming the field, for files that cannot be read or are of another version, and for everything that
+            the constructors refuse.
+    """
+    try:
+        body = json.loads(Path(path).read_text())
+    except (OSError, ValueError) as error:
+        raise InputError("controller file", str(path), f"a readable JSON file ({error})") from error
+    if not isinstance(body, dict) or body.get("format") != FORMAT:
+        found = body.get("format") if isinstance(body, dict) else type(body).__name__
+        raise InputError("controller.format", found, f"{FORMAT!r}, as this version writes it")
+    for key in ("kind", "structure", "tuning", "model", "options", "state"):
+        if key not in body:
+            raise InputError(f"controller.{key}", "nothing", "a value (the key is missing)")
+    try:
+        controller = _made(body)
+        return controller, None if body["state"] is None else _restored(controller, body["state"])
+    except InputError:
+        raise
+    except (TypeError, ValueError, AttributeError, KeyError) as error:
+        raise InputError("controller file", str(path), f"what save_controller writes ({error})") from error
+
+
+def _parts(controller: Controller) -> _Parts:
+    if isinstance(controller, TargetController):
+        inner = _parts(controller.controller)
+        cvs = controller.structure.cv_count
+        weights = np.asarray(inner.tuning.cv_weight)[cvs:].tolist()
+        names = [controller.structure.mv_names[i] for i in controller.targeted]
+        own = {key: getattr(inner.tuning, key)[:cvs] for key in CV_FIELDS}
+        assert isinstance(inner.model, StepResponseModel)
+        model = _model(controller.structure, inner.model.coefficients[:cvs])
+        options = {"target_weight": dict(zip(names, weights, strict=True)), **inner.options}
+        return _Parts(
+            "target", controller.structure, dataclasses.replace(inner.tuning, **own), model, options
+        )
+    structure, tuning = controller.structure, controller.tuning
+    if isinstance(controller, ScheduledController):
+        return _Parts("scheduled", structure, tuning, controller.schedule, {})
+    if isinstance(controller, ContinuousController):
+        model = _model(structure, controller.memory.coefficients)
+        options = {"summed": controller.qp.summed is not None, "switching": controller.switching}
+        return _Parts("continuous", structure, tuning, model, options)
+    options = {key: getattr(controller, key) for key in ("gap", "time_limit", "finish")}
+    if isinstance(controller, ScheduledMixedIntegerController):
+        table = {"spacing": controller.together.spacing, "kept": controller.together.kept}
+        return _Parts("scheduled-mixed-integer", structure, tuning, controller.schedule, options | table)
+    return _Parts("mixed-integer", structure, tuning, controller.model, options)
+
+
+def _model(structure: Structure, coefficients: Any) -> StepResponseModel:
+    s = structure
+    return make_model(coefficients, s.dt, s.cv_names, s.mv_names, cv_units=s.cv_units, mv_units=s.mv_units)
+
+
+KINDS = {
+    "continuous": ContinuousController,
+    "mixed-integer": MixedIntegerController,
+    "scheduled": ScheduledController,
+    "scheduled-mixed-integer": ScheduledMixedIntegerController,
+    "target": TargetController,
+}
+
+
+def _made(body: dict[str, Any]) -> Controller:
+    if body["kind"] not in KINDS:
+        raise InputError("controller.kind", body["kind"], f"one of {', '.join(KINDS)}")
+    tuples: dict[str, Any] = {
+        key: tuple(v) if isinstance(v, list) else v for key, v in body["structure"].items()
+    }
+    structure = Structure(**tuples)
+    fields = {key: _numbers(f"controller.tuning.{key}", values) for key, values in body["tuning"].items()}
+    tuning = make_tuning(structure, path="controller.tuning", **{k: v.tolist() for k, v in fields.items()})
+    scheduled = body["kind"].startswith("scheduled")
+    model = (ModelSchedule if scheduled else StepResponseModel).from_dict(body["model"])
+    return KINDS[body["kind"]](structure, tuning, model, **body["options"])  # pyright: ignore[reportArgumentType]
+
+
+def _restored(controller: Controller, saved: Any) -> ControllerState:
+    """The state with these numbers, in the form that the controller makes it."""
+    if not isinstance(saved, dict):
+        raise InputError("controller.state", type(saved).__name__, "an object with the fields of the state")
+    for key in ("base", "mv"):
+        if key not in saved:
+            raise InputError(f"controller.state.{key}", "nothing", "a value (the key is missing)")
+    base, mv = (_numbers(f"controller.state.{key}", saved[key]) for key in ("base", "mv"))
+    fresh = controller.init(base[: controller.structure.cv_count], mv)
+    wanted = _named(fresh)
+    for key in [*wanted, *saved]:
+        if key not in saved or key not in wanted:
+            expected = "a value (the key is missing)" if key in wanted else f"one of {', '.join(wanted)}"
+            raise InputError(f"controller.state.{key}", saved.get(key, "nothing"), expected)
+    leaves = []
+    for key, leaf in wanted.items():
+        value = _numbers(f"controller.state.{key}", saved[key])
+        if value.shape != np.shape(leaf):
+            shapes = f"shape {list(value.shape)}", f"shape {list(np.shape(leaf))}"
+            raise InputError(f"controller.state.{key}", *shapes)
+        value = value.astype(leaf.dtype)
+        leaves.append(jnp.asarray(value) if isinstance(leaf, jax.Array) else value)
+    return jax.tree.unflatten(jax.tree.structure(fresh), leaves)
+
+
+def _named(state: ControllerState) -> dict[str, Any]:
+    """The arrays of a state by their paths, such as ``warm.x``."""
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="."): v
+        for path, v in jax.tree.leaves_with_path(state)
+    }
+
+
+def _plain(value: Any) -> Any:
+    """An array as nested lists; JSON's numbers are read back to the last bit."""
+    if isinstance(value, list):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    return value if isinstance(value, (bool, int)) else _plain(np.asarray(value).tolist())
+
+
+def _numbers(path: str, given: Any) -> np.ndarray:
+    """The array of nested lists."""
+
+    def number(value: Any) -> Any:
+        if isinstance(value, list):
+            return [number(entry) for entry in value]
+        if isinstance(value, str):
+            value = NOT_FINITE.get(value)
+        if not isinstance(value, (bool, int, float)):
+            raise InputError(path, given, "numbers in nested lists")
+        return value
+
+    try:
+        return np.array(number(given))
+    except ValueError:
+        raise InputError(path, given, "lists of equal length") from None

@@ -1,0 +1,125 @@
+"""What a controller is told at a sample, checked once for all controllers: measurements, setpoints, positions, manual MVs.
+
+A measurement may be bad, that is judged later (`measurement`); everything else must make sense. Traced values
+(inside `jax.jit`, `jax.vmap`, `jax.lax.scan`) are checked for their shapes only.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import ArrayLike
+
+from jaxmpc.errors import InputError
+from jaxmpc.problem.structure import Structure
+
+
+class Sample(NamedTuple):
+    """What is known at a sample, the lane axis first where there are lanes.
+
+    Attributes:
+        cv: ``"cv"``, measured; not a number where nothing arrived [CV unit].
+        setpoint: ``"horizon cv"`` over the horizon, or ``"cv"`` held over it [CV unit].
+        mv: ``"mv"``, where the actuators stand; not a number where that is not known [MV unit].
+        manual: ``"mv"``, MVs that somebody else moves.
+    """
+
+    cv: Any
+    setpoint: Any
+    mv: Any
+    manual: Any
+
+
+def checked(
+    structure: Structure,
+    cv: ArrayLike,
+    setpoint: ArrayLike,
+    mv: ArrayLike | None = None,
+    manual: ArrayLike | None = None,
+    *,
+    lanes: int | None = None,
+) -> Sample:
+    """A sample of one controller, or of `lanes` of them with a lane axis first.
+
+    Raises:
+        InputError: naming the argument, for other shapes, texts, setpoints that are not finite, and where JAX's double
+            precision was switched off.
+    """
+    require_double_precision()
+    lead = () if lanes is None else (lanes,)
+    cvs, mvs, horizon = (structure.cv_count,), (structure.mv_count,), (structure.prediction_horizon,)
+    cv = _array("cv", cv, structure.cv_names, "CV unit", lead + cvs)
+    setpoint = _array("setpoint", setpoint, structure.cv_names, "CV unit", lead + cvs, lead + horizon + cvs)
+    if not isinstance(setpoint, Tracer) and not np.isfinite(setpoint).all():
+        raise InputError(
+            "setpoint", _shown(setpoint), f"finite numbers [CV unit] for {_names(structure.cv_names)}"
+        )
+    mv = (
+        np.full(lead + mvs, np.nan)
+        if mv is None
+        else _array("mv", mv, structure.mv_names, "MV unit", lead + mvs)
+    )
+    if manual is None:
+        manual = np.zeros(lead + mvs, dtype=bool)
+    elif not isinstance(manual, jax.Array):
+        manual = np.asarray(manual)
+    if manual.shape != lead + mvs or manual.dtype != np.bool_:
+        raise InputError("manual", _shown(manual), f"true or false for each of {_names(structure.mv_names)}")
+    return Sample(cv, setpoint, mv, manual)
+
+
+def checked_start(
+    structure: Structure, cv: ArrayLike, mv: ArrayLike, *, lanes: int | None = None
+) -> tuple[Any, Any]:
+    """Measured CVs and present MVs that a controller starts from; all must be known.
+
+    Raises:
+        InputError: naming the argument, for other shapes and values that are not finite.
+    """
+    require_double_precision()
+    out = []
+    for path, value, names, unit in (
+        ("cv", cv, structure.cv_names, "CV unit"),
+        ("mv", mv, structure.mv_names, "MV unit"),
+    ):
+        lead = () if lanes is None else (lanes,)
+        array = _array(path, value, names, unit, (*lead, len(names)))
+        if not isinstance(array, Tracer) and not np.isfinite(array).all():
+            raise InputError(path, _shown(array), f"{len(names)} finite numbers [{unit}] for {_names(names)}")
+        out.append(array)
+    return out[0], out[1]
+
+
+def require_double_precision() -> None:
+    """Refuse to work where JAX's double precision was switched off after `jaxmpc` was imported: no bound would be right."""
+    if jax.dtypes.canonicalize_dtype(np.float64) != np.float64:
+        raise InputError(
+            "jax_enable_x64",
+            False,
+            "True, as importing jaxmpc sets it: certificates need double precision",
+            "Call jax.config.update('jax_enable_x64', True)",
+        )
+
+
+def _array(path: str, given: Any, names: tuple[str, ...], unit: str, *shapes: tuple[int, ...]) -> Any:
+    """An array of floats of one of the shapes; JAX arrays and traced values stay what they are."""
+    expected = f"shape {' or '.join(str(list(s)) for s in shapes)}, numbers [{unit}] for {_names(names)}"
+    try:
+        value = given if isinstance(given, jax.Array) else np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(path, _shown(given), expected) from None
+    if value.shape not in shapes:
+        raise InputError(path, f"shape {list(value.shape)}", expected)
+    return value
+
+
+def _names(names: tuple[str, ...]) -> str:
+    return ", ".join(names)
+
+
+def _shown(value: Any) -> Any:
+    """A value as an error shows it: its shape where it is long."""
+    return f"shape {list(np.shape(value))}" if np.size(value) > 8 else np.asarray(value).tolist()

@@ -1,0 +1,350 @@
+"""Gain scheduling (thesis chapter 8): step-response models over a grid of working points, and controllers that use them.
+
+The choke of a gas-lifted well does several times more near closed than at half open. A schedule interpolates between models
+that were identified at several positions; every sample, the controllers here predict their future moves with the model of
+the present MVs.
+
+A change of model is bumpless. What past moves will still do stays in the shift register of `controller.Memory` as it was
+predicted when they were made; only the response of moves from now on changes. What the prediction then misses is
+output bias, as ever (2.31).
+
+Moves are planned with the model of the present MVs, but a move that is made enters the register with the model half-way
+along it. A step up and the step back then cancel; with the models of their two starting points they do not, and near
+closed what is left feeds a limit cycle between two positions.
+"""
+
+from __future__ import annotations
+
+import collections
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxmpc.controller.continuous import ContinuousController, ControllerState, StepInfo
+from jaxmpc.controller.mixed_integer import MixedIntegerController, MixedIntegerControllers
+from jaxmpc.controller.sample import Sample
+from jaxmpc.errors import InputError
+from jaxmpc.files import write_atomically
+from jaxmpc.model.step_response import StepResponseModel, advance_free_response, make_model
+from jaxmpc.problem.condense import condense
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import Tuning
+
+FORMAT = "jaxmpc/gain-schedule/1"
+SPACING = 250.0  # of continuous MVs in the table of mixed-integer controllers [MV unit]
+KEPT = 32  # mixed-integer controllers kept, 2.5 MB each at thesis size
+
+
+class ModelSchedule(eqx.Module):
+    """Step-response models over a grid of two MVs.
+
+    Attributes:
+        choke: ``"choke"``, positions of the first MV, increasing [%].
+        lift: ``"lift"``, values of the second MV, increasing [m3/h].
+        coefficients: ``"choke lift cv mv n"``, S(1)..S(N) at each of them [CV unit per MV unit].
+        reference: a model with the names, units and dt of all; its coefficients are those of the middle of the grid.
+    """
+
+    choke: Float[Array, " choke"]
+    lift: Float[Array, " lift"]
+    coefficients: Float[Array, "choke lift cv mv n"]
+    reference: StepResponseModel
+
+    def coefficients_at(self, mv: Float[Array, " mv"]) -> Float[Array, "cv mv n"]:
+        """S(1)..S(N) at the MVs [MV unit], bilinear; beyond the grid those of its border. Pure: jit it, vmap it."""
+        i, next_i, along_choke = _cell(self.choke, mv[0])
+        j, next_j, along_lift = _cell(self.lift, mv[1])
+        s = self.coefficients
+        low = s[i, j] + along_lift * (s[i, next_j] - s[i, j])  # equal models give exactly that model
+        high = s[next_i, j] + along_lift * (s[next_i, next_j] - s[next_i, j])
+        return low + along_choke * (high - low)
+
+    def model_at(self, mv) -> StepResponseModel:
+        """The model at the MVs [MV unit], as `coefficients_at`."""
+        return eqx.tree_at(
+            lambda m: m.coefficients, self.reference, _coefficients_at(self, np.asarray(mv, dtype=np.float64))
+        )
+
+    def save(self, path: str | Path) -> Path:
+        """Write the schedule as JSON; the file is replaced in one go, so a crash leaves the old one."""
+        return write_atomically(path, json.dumps(self.to_dict()))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of the file, which `from_dict` reads again."""
+        model = self.reference
+        return {
+            "format": FORMAT,
+            "dt": model.dt,
+            "cv": list(model.cv_names),
+            "mv": list(model.mv_names),
+            "cv_units": list(model.cv_units),
+            "mv_units": list(model.mv_units),
+            "provenance": dict(model.provenance),
+            "grid": {
+                name: np.asarray(values).tolist()
+                for name, values in zip(model.mv_names, (self.choke, self.lift), strict=True)
+            },
+            "coefficients": np.asarray(self.coefficients).tolist(),
+        }
+
+    @classmethod
+    def load(cls, path: str | Path) -> ModelSchedule:
+        """Read a schedule written by `save`. Raises `InputError` naming the field that is wrong."""
+        try:
+            body = json.loads(Path(path).read_text())
+        except (OSError, ValueError, RecursionError) as error:
+            raise InputError("schedule file", str(path), f"a readable JSON file ({error})") from error
+        return cls.from_dict(body)
+
+    @classmethod
+    def from_dict(cls, body: Any) -> ModelSchedule:
+        """The schedule of a file's content. Raises `InputError` naming the field that is wrong."""
+        if not isinstance(body, dict):
+            expected = "an object with dt, cv, mv, grid and coefficients"
+            raise InputError("schedule", type(body).__name__, expected)
+        for key in ("dt", "cv", "mv", "grid", "coefficients"):
+            if key not in body:
+                raise InputError(f"schedule.{key}", "nothing", "a value (the key is missing)")
+        names, grid = body["mv"], body["grid"]
+        if not isinstance(grid, dict) or sorted(grid) != sorted(names):
+            raise InputError("schedule.grid", grid, f"one list of values for each of {names}")
+        axes = [grid[name] for name in names]
+        rows = body["coefficients"]
+        if len(rows) != len(axes[0]) or any(len(row) != len(axes[1]) for row in rows):
+            raise InputError(
+                "schedule.coefficients", f"{len(rows)} rows", f"{len(axes[0])} rows of {len(axes[1])} models"
+            )
+        return make_schedule(
+            [
+                make_model(
+                    rows[i][j],
+                    body["dt"],
+                    body["cv"],
+                    names,
+                    cv_units=body.get("cv_units", ()),
+                    mv_units=body.get("mv_units", ()),
+                    working_point={names[0]: first, names[1]: second},
+                    provenance=body.get("provenance", {}),
+                    path=f"schedule.coefficients[{i}][{j}]",
+                )
+                for i, first in enumerate(axes[0])
+                for j, second in enumerate(axes[1])
+            ]
+        )
+
+
+def make_schedule(models: Sequence[StepResponseModel]) -> ModelSchedule:
+    """Checked constructor from models whose working points form a grid.
+
+    Args:
+        models: one per working point, in any order; of the same names, dt and number of coefficients, two MVs.
+
+    Raises:
+        InputError: naming the model that does not fit, or the working point that is missing or there twice.
+    """
+    if not models:
+        raise InputError("models", "nothing", "one or more, one per working point")
+    first = models[0]
+    if len(first.mv_names) != 2:
+        raise InputError("models[0].mv", list(first.mv_names), "two MVs, the axes of the grid")
+    points: dict[tuple[float, float], StepResponseModel] = {}
+    for k, model in enumerate(models):
+        for key in ("cv_names", "mv_names", "cv_units", "mv_units", "dt", "samples"):
+            if getattr(model, key) != getattr(first, key):
+                raise InputError(
+                    f"models[{k}].{key}", getattr(model, key), f"{getattr(first, key)} as models[0]"
+                )
+        where = dict(model.working_point)
+        missing = [name for name in model.mv_names if not np.isfinite(where.get(name, np.nan))]
+        if missing:
+            raise InputError(
+                f"models[{k}].working_point.{missing[0]}", where.get(missing[0]), "a finite value [MV unit]"
+            )
+        point = (where[model.mv_names[0]], where[model.mv_names[1]])
+        if point in points:
+            raise InputError(f"models[{k}].working_point", point, "a working point that no other model has")
+        points[point] = model
+    axes = [sorted({point[axis] for point in points}) for axis in (0, 1)]
+    for point in [(a, b) for a in axes[0] for b in axes[1]]:
+        if point not in points:
+            raise InputError("models", f"none at {point}", "a model at every point of the grid")
+    middle = points[axes[0][len(axes[0]) // 2], axes[1][len(axes[1]) // 2]]
+    coefficients = [[points[a, b].coefficients for b in axes[1]] for a in axes[0]]
+    return ModelSchedule(
+        choke=jnp.asarray(axes[0]),
+        lift=jnp.asarray(axes[1]),
+        coefficients=jnp.stack([jnp.stack(row) for row in coefficients]),
+        reference=middle,
+    )
+
+
+def _cell(grid: Float[Array, " point"], value):
+    """The grid points around a value and how far it is from the first to the second, 0..1."""
+    last = grid.shape[0] - 1
+    if last == 0:
+        return 0, 0, 0.0
+    i = jnp.clip(jnp.searchsorted(grid, value, side="right") - 1, 0, last - 1)
+    return i, i + 1, jnp.clip((value - grid[i]) / (grid[i + 1] - grid[i]), 0.0, 1.0)
+
+
+def _half_way(schedule: ModelSchedule, used: Float[Array, "cv mv future"], future, before, move):
+    """The shift register with the effect of a move by the model half-way along it, not by the one that planned it."""
+    model = eqx.tree_at(
+        lambda m: m.coefficients, schedule.reference, schedule.coefficients_at(before + 0.5 * move)
+    )
+    return advance_free_response(future, model.extended(used.shape[-1]) - used, move)
+
+
+_corrected = jax.jit(_half_way)
+_coefficients_at: Any = jax.jit(ModelSchedule.coefficients_at)
+
+
+class ScheduledController(ContinuousController):
+    """MPC with continuous moves and the model of the present MVs; pure, so that it can be jitted, vmapped, scanned.
+
+    The condensed problem is built from the interpolated coefficients inside the step.
+
+    Args:
+        structure: static configuration without integer MVs.
+        tuning: weights and limits; batch its fields to batch controllers (`batch.build_lanes`).
+        schedule: of step-response models.
+    """
+
+    schedule: ModelSchedule
+
+    def __init__(self, structure: Structure, tuning: Tuning, schedule: ModelSchedule):
+        super().__init__(structure, tuning, schedule.reference)
+        self.schedule = schedule
+
+    def decide(self, state: ControllerState, sample: Sample) -> tuple[ControllerState, StepInfo]:
+        """`step` of a checked sample, to be traced."""
+        s = self.structure
+        standing = self.memory.locate(state, sample.mv, sample.manual).mv
+        model = eqx.tree_at(
+            lambda m: m.coefficients, self.schedule.reference, self.schedule.coefficients_at(standing)
+        )
+        now = eqx.tree_at(
+            lambda c: (c.memory.coefficients, c.qp),
+            self,
+            (
+                model.extended(max(s.prediction_horizon, model.samples)),
+                condense(s, self.tuning, model.coefficients, envelope=0, summed=False),
+            ),
+        )
+        state, info = ContinuousController.decide(now, state, sample)
+        future = _half_way(self.schedule, now.memory.coefficients, state.future, standing, info.move)
+        return eqx.tree_at(lambda s: s.future, state, future), info
+
+
+class ScheduledMixedIntegerControllers(MixedIntegerControllers):
+    """The batch of one that `ScheduledMixedIntegerController` steps: a table of controllers over the present MVs.
+
+    Args:
+        structure: static configuration with at least one integer MV.
+        tuning: weights and limits.
+        schedule: of step-response models.
+        spacing: of the table in continuous MVs [MV unit]; integer MVs have one row per step.
+        kept: controllers kept; the one used least recently goes first.
+        **options: ``gap``, ``time_limit`` and ``finish`` of `MixedIntegerControllers`.
+    """
+
+    def __init__(
+        self,
+        structure: Structure,
+        tuning: Tuning,
+        schedule: ModelSchedule,
+        *,
+        spacing: float = SPACING,
+        kept: int = KEPT,
+        **options: Any,
+    ):
+        if not (np.isfinite(spacing) and spacing > 0):
+            raise InputError("spacing", spacing, "a positive distance of models in the table [MV unit]")
+        if isinstance(kept, bool) or not isinstance(kept, int) or kept < 1:
+            raise InputError("kept", kept, "a whole number of controllers, 1 or more")
+        super().__init__(structure, [tuning], [schedule.reference], **options)
+        self.tuning, self.schedule, self.options = tuning, schedule, options
+        self.spacing, self.kept = spacing, kept
+        self.grid = np.array([step or spacing for step in structure.integer_step])
+        self.built = 0  # controllers made so far
+        self._table: collections.OrderedDict[tuple[float, ...], MixedIntegerControllers] = (
+            collections.OrderedDict()
+        )
+
+    def at(self, mv) -> MixedIntegerControllers:
+        """The controller for the MVs [MV unit], rounded to the table; made when first needed."""
+        point = tuple((np.round(np.asarray(mv) / self.grid) * self.grid).tolist())
+        if point not in self._table:
+            model = self.schedule.model_at(point)
+            self._table[point] = MixedIntegerControllers(
+                self.structure, [self.tuning], [model], **self.options
+            )
+            self.built += 1
+            if len(self._table) > self.kept:
+                self._table.popitem(last=False)
+        self._table.move_to_end(point)
+        return self._table[point]
+
+    def prepare(self, state: ControllerState, cv: Float[np.ndarray, "scenario cv"]) -> None:
+        """Compile what nearly every sample needs; arguments as in `step`."""
+        controllers = self.at(state.mv[0])
+        controllers.prepare(state, cv)
+        used = controllers.memory.lane(0).coefficients
+        _corrected(self.schedule, used, state.future[0], state.mv[0], state.last_move[0])
+
+    def decide(self, state: ControllerState, sample: Sample) -> tuple[ControllerState, StepInfo]:
+        """`step` of a checked sample. Its time includes the making of a controller."""
+        begin = time.perf_counter()
+        before = np.where(np.isfinite(sample.mv[0]), sample.mv[0], np.asarray(state.mv)[0])
+        controllers = self.at(before)
+        made = time.perf_counter() - begin
+        state, info = controllers.decide(state, sample)
+        begin = time.perf_counter()
+        # moves of the others are too small to matter
+        if np.any(info.move[0, list(self.structure.integer_mvs)]):
+            used = controllers.memory.lane(0).coefficients
+            future = _corrected(self.schedule, used, state.future[0], before, info.move[0])
+            state = eqx.tree_at(lambda s: s.future, state, np.asarray(future)[None])
+        made += time.perf_counter() - begin
+        return state, eqx.tree_at(lambda i: i.solve_time, info, info.solve_time + made)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy needs; the table is filled again."""
+        return super().__getstate__() | {"_table": collections.OrderedDict()}
+
+
+class ScheduledMixedIntegerController(MixedIntegerController):
+    """MPC with whole moves of the integer MVs and the model of the present MVs; runs on the host, solves exactly.
+
+    Args:
+        structure: static configuration with at least one integer MV.
+        tuning: weights and limits.
+        schedule: of step-response models.
+        spacing: of the table in continuous MVs [MV unit].
+        kept: controllers kept.
+        **options: ``gap``, ``time_limit`` and ``finish`` of `MixedIntegerController`.
+    """
+
+    def __init__(
+        self,
+        structure: Structure,
+        tuning: Tuning,
+        schedule: ModelSchedule,
+        *,
+        spacing: float = SPACING,
+        kept: int = KEPT,
+        **options: Any,
+    ):
+        super().__init__(structure, tuning, schedule.reference, **options)
+        self.schedule = schedule
+        self.together = ScheduledMixedIntegerControllers(
+            structure, tuning, schedule, spacing=spacing, kept=kept, **options
+        )

@@ -1,0 +1,76 @@
+"""Quadratic cuts: what problems solved at whole moves prove about all other whole moves.
+
+The problem over whole moves d is V(d) = own(d) + R(d), own the integer moves' own weight and R convex. Its quadratic
+part keeps the curvature S once the continuous moves are minimised out, so the prices of a solved problem at d_k give
+
+    R(d) >= R_k + g_k'(d - d_k) + 1/2 (d - d_k)' S (d - d_k)
+
+everywhere: the cut of outer approximation (Duran and Grossmann 1986) with the curvature kept. The few cuts at the
+best candidates of a level set close nearly every step of the thesis's controller.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxmpc.integer.constants import Constants
+from jaxmpc.integer.relaxer import Relaxations
+
+
+def cut_of(constants: Constants, result: Relaxations, lane: int, lower, upper):
+    """Value, place and gradient of R as one solved lane proves them.
+
+    Args:
+        constants: of the scenario.
+        result: solved lanes.
+        lane: which of them.
+        lower: integer limits the lane was solved with.
+        upper: the same.
+    """
+    c = constants
+    at = result.x[lane, c.integer]
+    gradient = result.gradient[lane, c.integer].copy()
+    # undo the box of the integers that the bound minimised over, and the linearised own weight
+    value = result.bound[lane] - np.minimum(gradient * (lower - at), gradient * (upper - at)).sum()
+    if c.levels:
+        price = result.envelope[lane].reshape(c.levels, -1)
+        knot = c.knot.reshape(c.levels, -1)
+        value -= (price * at - knot * np.abs(price)).sum()
+        gradient -= price.sum(axis=0)
+    return float(value), at, gradient
+
+
+class Cuts:
+    """The cuts of one scenario."""
+
+    def __init__(self, constants: Constants):
+        self.constants = constants
+        self.list: list[tuple[float, np.ndarray, np.ndarray]] = []
+
+    def add(self, result: Relaxations, lane: int, lower, upper) -> None:
+        """Take the cut of a solved lane."""
+        cut = cut_of(self.constants, result, lane, lower, upper)
+        if np.isfinite(cut[0]) and np.isfinite(cut[2]).all():
+            self.list.append(cut)
+
+    def bounds(self, points: Int[np.ndarray, "point integer"], first: int = 0) -> Float[np.ndarray, " point"]:
+        """Lower bound of V at whole moves, by all cuts from number `first` on."""
+        c = self.constants
+        best = np.full(len(points), -np.inf)
+        for value, at, gradient in self.list[first:]:
+            away = points - at
+            curved = away @ c.root_factor
+            best = np.maximum(best, value + away @ gradient + 0.5 * np.einsum("pi,pi->p", curved, curved))
+        return best + (c.own_weight * points**2).sum(axis=1)
+
+    def tangent(self, point: Int[np.ndarray, " integer"]):
+        """Value, place and gradient at `point` of the cut of R that is highest there."""
+        c = self.constants
+        best = (-np.inf, point, np.zeros(len(point)))
+        for value, at, gradient in self.list:
+            bent = c.schur @ (point - at)
+            height = value + (point - at) @ (gradient + 0.5 * bent)
+            if height > best[0]:
+                best = (float(height), point, gradient + bent)
+        return best

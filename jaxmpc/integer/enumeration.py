@@ -1,0 +1,71 @@
+"""Closing an integer problem by listing what a level set leaves and pruning the list with quadratic cuts.
+
+The candidates below the incumbent come from the root's lower model (`levelset`). The best few are solved in one batch; each
+adds a cut (`cuts`) that bounds all others at once, so that a list of thousands is done in one or two rounds.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxmpc.integer.cuts import Cuts
+from jaxmpc.integer.feasible import satisfied
+from jaxmpc.integer.host_search import Search, Steps
+from jaxmpc.integer.lower_bound import LowerModel, enumerate_below
+
+MOST = 20_000  # partial candidates alive at once from which the list is given up
+CELLS = 600_000  # the same in single moves, for long horizons
+FIRST, MOST_AT_ONCE = 2, 64  # candidates solved in the first round; later ones take twice as many
+
+
+def enumerate_all(
+    search: Search,
+    model: LowerModel,
+    cuts: Cuts,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    *,
+    limited: bool = True,
+) -> Steps:
+    """Close the problem over these limits; returns whether that was done.
+
+    Args:
+        search: with an incumbent.
+        model: root's lower model.
+        cuts: known so far; more are added.
+        lower: limits of the integer moves, within the model's.
+        upper: the same.
+        limited: give up where the list grows beyond `MOST`.
+    """
+    most = max(min(MOST, CELLS // max(len(lower), 1)), 1) if limited else None
+    found = enumerate_below(model, search.chains, lower, upper, search.cutoff, most)
+    if found is None:
+        return False
+    search.discard(search.cutoff)
+    points, bounds, _ = found
+    keep = satisfied(search.chains, points, lower, upper) if len(points) else np.zeros(0, dtype=bool)
+    keep &= np.array([p.tobytes() not in search.seen for p in points], dtype=bool)
+    points, bounds = points[keep], bounds[keep]
+    bounds = np.maximum(bounds, cuts.bounds(points))
+    rounds = 0
+    while True:
+        alive = bounds < search.cutoff
+        if not alive.all():
+            search.discard(float(bounds[~alive].min()))
+            points, bounds = points[alive], bounds[alive]
+        if not len(points):
+            return True
+        if search.out_of_time():
+            search.discard(float(bounds.min()))
+            return False
+        size = min(FIRST * 2**rounds, MOST_AT_ONCE)
+        rank = np.argsort(bounds, kind="stable")
+        chosen, rest = rank[:size], rank[size:]
+        known = len(cuts.list)
+        result = yield from search.evaluate(points[chosen], bounds[chosen])
+        search.nodes += len(chosen)
+        for lane, point in enumerate(points[chosen]):
+            cuts.add(result, lane, point, point)
+        points, bounds = points[rest], bounds[rest]
+        bounds = np.maximum(bounds, cuts.bounds(points, known))
+        rounds += 1

@@ -1,0 +1,235 @@
+"""Hard limits on whole moves: which integers a search may still choose (thesis 6.1, 6.5).
+
+The rows of different MVs are independent, and those of one MV form a chain: the position after a block is the
+position before it plus the block's move, and the oscillation rows couple neighbours only. Limits therefore
+propagate along the chain, and a dynamic programme over (position, last move) decides feasibility exactly.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from jaxmpc.problem.blocking import moves_per_block, oscillation_rows, window_rows
+from jaxmpc.problem.structure import Structure
+
+NEAR = (3, 30)  # steps around the wanted moves in which the nearest are looked for first
+MOST = 20_000_000  # combinations of position and move that are looked at in one chain
+HELD = 2_000_000  # of them that are remembered
+UNBOUNDED = 10**12  # whole steps that stand for "no limit" in integer arithmetic
+
+
+class UndecidedError(Exception):
+    """Whether whole moves satisfy the hard rows would take too long to find out."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Chain:
+    """The blocks of one integer MV.
+
+    Attributes:
+        columns: positions of its moves in the integer vector.
+        counts: moves per block.
+        low, high: allowed position after each block, in steps from now.
+        coupled: whether the move of block b and of b - 1 may differ by one step at most (first entry unused).
+        windows, window_low, window_high: rows of the predictive mean-move limit; checked, not propagated.
+    """
+
+    columns: Int[np.ndarray, " block"]
+    counts: Int[np.ndarray, " block"]
+    low: Int[np.ndarray, " block"]
+    high: Int[np.ndarray, " block"]
+    coupled: Bool[np.ndarray, " block"]
+    windows: np.ndarray
+    window_low: np.ndarray
+    window_high: np.ndarray
+
+
+def chains_of(structure: Structure, row_low: np.ndarray, row_high: np.ndarray) -> list[Chain]:
+    """Chains of all integer MVs from the limits of `blocking.hard_rows`."""
+    blocks, counts = structure.block_count, moves_per_block(structure)
+    pairs = oscillation_rows(structure)
+    to_block = np.argmax(pairs, axis=1) if len(pairs) else np.zeros(0, dtype=int)
+    windows = window_rows(structure)
+    chains, row = [], 0
+    for mv in range(structure.mv_count):
+        low, high = row_low[row : row + blocks], row_high[row : row + blocks]
+        row += blocks
+        if mv in structure.integer_mvs:
+            coupled = np.zeros(blocks, dtype=bool)
+            coupled[to_block] = np.isfinite(row_high[row : row + len(pairs)])
+            row += len(pairs)
+            ahead = slice(row, row + len(windows))
+            columns = len(chains) * blocks + np.arange(blocks)
+            chains.append(
+                Chain(
+                    columns,
+                    counts,
+                    whole(low),
+                    whole(high),
+                    coupled,
+                    windows,
+                    row_low[ahead],
+                    row_high[ahead],
+                )
+            )
+        row += len(windows)
+    return chains
+
+
+def whole(steps: np.ndarray) -> Int[np.ndarray, "..."]:
+    """Whole steps, with `UNBOUNDED` for anything larger and for no limit."""
+    return np.clip(np.round(steps), -UNBOUNDED, UNBOUNDED).astype(int)
+
+
+def propagate(
+    chains: list[Chain], lower: np.ndarray, upper: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Tighten integer limits along every chain until nothing changes.
+
+    Args:
+        chains: the hard rows.
+        lower, upper: ``"batch integer"`` limits of the moves [steps].
+
+    Returns:
+        ``(lower, upper, possible)``: the tightened copies, and per lane whether no domain is empty.
+    """
+    lower, upper = lower.copy(), upper.copy()
+    for _ in range(2 * lower.shape[1]):
+        before = (lower.copy(), upper.copy())
+        for chain in chains:
+            _sweep(chain, lower, upper)
+        if np.array_equal(before[0], lower) and np.array_equal(before[1], upper):
+            break
+        if (lower > upper).any(axis=1).all():
+            break
+    return lower, upper, np.asarray((lower <= upper).all(axis=1))
+
+
+def _sweep(chain: Chain, lower: np.ndarray, upper: np.ndarray) -> None:
+    """One pass over a chain, in place: oscillation rows, positions reachable from both ends, moves between them."""
+    counts, place = chain.counts, np.arange(len(chain.columns))
+    own_low, own_high = lower[:, chain.columns], upper[:, chain.columns]
+    # |d_b - d_(b-1)| <= 1 lets a limit weaken by one per block; runs of coupled blocks are kept apart by a large offset
+    run = np.cumsum(~chain.coupled) * (8 * UNBOUNDED)
+    own_low = _running_max(own_low + place + run) - place - run
+    own_high = -_running_max(-own_high + place + run) + place + run
+    own_low = _running_max_back(own_low - place - run) + place + run
+    own_high = -_running_max_back(-own_high - place - run) - place - run
+    # positions: forward from zero within the limits, then backward
+    low = _reach(chain.low, np.cumsum(own_low * counts, axis=1))
+    high = -_reach(-chain.high, -np.cumsum(own_high * counts, axis=1))
+    after = np.zeros_like(own_low)
+    after[:, :-1] = own_high[:, 1:] * counts[1:]
+    low = _back(low, after)
+    after[:, :-1] = own_low[:, 1:] * counts[1:]
+    high = -_back(-high, -after)
+    before_low, before_high = np.zeros_like(low), np.zeros_like(high)
+    before_low[:, 1:], before_high[:, 1:] = low[:, :-1], high[:, :-1]
+    lower[:, chain.columns] = np.maximum(own_low, -((before_high - low) // counts))
+    upper[:, chain.columns] = np.minimum(own_high, (high - before_low) // counts)
+
+
+def _running_max(values: np.ndarray) -> np.ndarray:
+    return np.maximum.accumulate(values, axis=1)
+
+
+def _running_max_back(values: np.ndarray) -> np.ndarray:
+    return np.maximum.accumulate(values[:, ::-1], axis=1)[:, ::-1]
+
+
+def _reach(limit: np.ndarray, total: np.ndarray) -> np.ndarray:
+    """Least positions from zero on with moves of sum `total`, never below `limit`."""
+    return total + np.maximum(_running_max(limit - total), 0)
+
+
+def _back(low: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Least positions from which the later ones can be reached: low_b >= low_(b+1) - after_b."""
+    ahead = np.cumsum(after, axis=1) - after  # what all moves before block b's successor add at most
+    return _running_max_back(low - ahead) + ahead
+
+
+def satisfied(chains: list[Chain], moves: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Whether whole moves ``"batch integer"`` satisfy every hard row exactly."""
+    good = ((moves >= lower) & (moves <= upper)).all(axis=1)
+    for chain in chains:
+        own = moves[:, chain.columns]
+        position = np.cumsum(own * chain.counts, axis=1)
+        good &= ((position >= chain.low) & (position <= chain.high)).all(axis=1)
+        steps = np.abs(np.diff(own, axis=1))
+        good &= (steps[:, chain.coupled[1:]] <= 1).all(axis=1)
+        if len(chain.windows):
+            total = own @ chain.windows.T
+            good &= ((total >= chain.window_low - 1e-6) & (total <= chain.window_high + 1e-6)).all(axis=1)
+    return np.asarray(good)
+
+
+def nearest(
+    chains: list[Chain], wanted: np.ndarray, lower: np.ndarray, upper: np.ndarray
+) -> np.ndarray | None:
+    """Feasible whole moves closest to `wanted` in the sum of absolute differences, or None where there are none.
+
+    Window rows are not looked at. Dynamic programming over (position, last move), exact; costs milliseconds and is
+    called only when rounding breaks a hard row.
+
+    Raises:
+        UndecidedError: where there are more moves and positions than can be looked at.
+    """
+    result = np.zeros(len(wanted), dtype=int)
+    for chain in chains:
+        path = _nearest_in_chain(chain, wanted[chain.columns], lower[chain.columns], upper[chain.columns])
+        if path is None:
+            return None
+        result[chain.columns] = path
+    return result
+
+
+def _nearest_in_chain(chain: Chain, wanted, lower, upper) -> list[int] | None:
+    """Of one MV: among the moves around the wanted ones first, which are few."""
+    around = whole(wanted)
+    for reach in NEAR:
+        low, high = np.maximum(lower, around - reach), np.minimum(upper, around + reach)
+        if (low == lower).all() and (high == upper).all():
+            break
+        path = _among(chain, wanted, low, high)
+        # paths that leave these limits have a move that alone is farther away
+        if path is not None and np.abs(path - wanted).sum() <= reach:
+            return path
+    return _among(chain, wanted, lower, upper)
+
+
+def _among(chain: Chain, wanted, lower, upper) -> list[int] | None:
+    """Of one MV, by dynamic programming over all moves within these limits."""
+    looked_at = kept = 0
+    layers: list[dict] = [{(0, None): (0.0, None, None)}]
+    for b in range(len(wanted)):
+        layer: dict = {}
+        remember = b + 1 < len(wanted) and chain.coupled[b + 1]
+        for state, (cost, _, _) in layers[-1].items():
+            position, last = state
+            first, final = int(lower[b]), int(upper[b])
+            if chain.coupled[b]:
+                first, final = max(first, last - 1), min(final, last + 1)
+            count = int(chain.counts[b])
+            first = max(first, -((position - int(chain.low[b])) // count))
+            final = min(final, (int(chain.high[b]) - position) // count)
+            looked_at += max(final - first + 1, 0)
+            if looked_at > MOST or kept + len(layer) + final - first >= HELD:
+                raise UndecidedError
+            for move in range(first, final + 1):
+                key = (position + count * move, move if remember else None)
+                total = cost + abs(move - wanted[b])
+                if key not in layer or total < layer[key][0]:
+                    layer[key] = (total, state, move)
+        if not layer:
+            return None
+        layers.append(layer)
+        kept += len(layer)
+    key = min(layers[-1], key=lambda k: layers[-1][k][0])
+    path = []
+    for layer in layers[:0:-1]:
+        _, key, move = layer[key]
+        path.append(move)
+    return path[::-1]

@@ -1,0 +1,197 @@
+"""State of one exact solve over whole moves: incumbent, bound of what was discarded, time spent.
+
+`integer` runs the line of a solve on it; `enumeration`, `outer_approximation` and `branch_and_bound` are ways to close it. A
+search is a generator: it yields what it needs solved and is sent the results, so that `scheduling` serves many side by side.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Generator, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxmpc.integer.constants import Constants
+from jaxmpc.integer.feasible import Chain, chains_of, nearest, satisfied, whole
+from jaxmpc.integer.lower_bound import LowerModel
+from jaxmpc.integer.relaxer import Relaxations
+from jaxmpc.problem.condense import QpInstance
+from jaxmpc.relaxed.gap import FINEST, closes, cutoff, reference
+from jaxmpc.relaxed.newton import WarmStart
+from jaxmpc.status import FAILED, INFEASIBLE, LIMIT, OPTIMAL
+
+GROUP = 8  # problems a search asks for at once: as many as one small batch holds
+
+
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """Relaxed problems a search wants solved: limits of all moves ``"lane n"`` and where to start ``"lane"``."""
+
+    lower: np.ndarray
+    upper: np.ndarray
+    starts: WarmStart
+
+
+@dataclasses.dataclass(frozen=True)
+class Offload:
+    """Work outside the device (a MILP) that a search wants done in a thread."""
+
+    work: Callable[[], Any]
+
+
+Steps = Generator[Request | Offload, Any, Any]  # a search, or a part of one
+
+
+@dataclasses.dataclass
+class SearchResult:
+    """Outcome of an integer solve: scaled moves, value, bound, status code, who finished, nodes, root prices, seconds."""
+
+    x: np.ndarray | None
+    value: float
+    bound: float
+    status: int
+    finished_by: str | None
+    nodes: int
+    root: WarmStart | None = None
+    seconds: float = 0.0
+
+
+class Search:
+    """State of one integer solve.
+
+    Args:
+        constants: of the structure, model and tuning.
+        instance: the problem of this sample, on the host.
+        root: its solved relaxation, lane 0.
+        gap: relative gap at which a solve is optimal.
+        time_limit: seconds of work on this problem after which the best plan so far is returned; None for none.
+    """
+
+    def __init__(
+        self,
+        constants: Constants,
+        instance: QpInstance,
+        root: Relaxations,
+        gap: float,
+        time_limit: float | None,
+    ):
+        self.constants, self.instance, self.time_limit = constants, instance, time_limit
+        self.gap = max(gap, FINEST)
+        self.limits = np.asarray(instance.lower), np.asarray(instance.upper)
+        self.chains: list[Chain] = chains_of(
+            constants.structure, np.asarray(instance.row_low), np.asarray(instance.row_high)
+        )
+        self.root, self.start = root, root.start(0)
+        self.root_bound = max(float(root.bound[0]), 0.0)  # every term of (6.6) is non-negative
+        self.value, self.x = np.inf, None
+        self.left_out = np.inf  # least bound of everything that was discarded
+        self.nodes = 1
+        self.seen: set[bytes] = set()
+        self.spent = 0.0  # seconds of work so far, kept by the scheduler
+
+    # ---- bookkeeping
+    @property
+    def cutoff(self) -> float:
+        """Bounds from here on cannot improve the incumbent by more than the gap."""
+        return cutoff(self.value, self.constants.scale, self.gap) if np.isfinite(self.value) else np.inf
+
+    @property
+    def reference(self) -> float:
+        """What gaps of the incumbent are relative to."""
+        return reference(self.value, self.constants.scale)
+
+    def out_of_time(self) -> bool:
+        """Whether the time limit is used up."""
+        return self.time_limit is not None and self.spent >= self.time_limit
+
+    def seconds_left(self) -> float | None:
+        """Seconds to the time limit, None without one."""
+        return None if self.time_limit is None else max(self.time_limit - self.spent, 0.0)
+
+    def discard(self, bound: float) -> None:
+        """Record the bound of something that is not searched further."""
+        self.left_out = min(self.left_out, bound)
+
+    # ---- relaxations
+    def relax(self, lower: np.ndarray, upper: np.ndarray, starts: list[WarmStart] | None = None) -> Steps:
+        """Solve relaxed problems with integer limits ``"batch integer"``; returns `Relaxations`.
+
+        Args:
+            lower: integer lower limits.
+            upper: integer upper limits.
+            starts: prices to start from, one per problem; the root's if not given.
+        """
+        count, integer = len(lower), self.constants.integer
+        wide_low, wide_high = (np.repeat(v[None], count, axis=0) for v in self.limits)
+        wide_low[:, integer], wide_high[:, integer] = lower, upper
+        if starts is None:
+            stacked = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape)), self.start)
+        else:
+            stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *starts)
+        return (yield Request(wide_low, wide_high, stacked))
+
+    def offer(self, result: Relaxations, lane: int) -> None:
+        """Take a solved problem with its integer moves rounded as incumbent if that is better."""
+        if result.snapped[lane] < self.value and np.isfinite(result.x[lane]).all():
+            self.value, self.x = float(result.snapped[lane]), result.x[lane].copy()
+            self.x[self.constants.integer] = np.round(self.x[self.constants.integer])
+
+    def evaluate(self, points: np.ndarray, bounds: np.ndarray | None = None) -> Steps:
+        """Solve the problems with the whole moves fixed, take the best as incumbent, discard the rest.
+
+        Returns:
+            `Relaxations`.
+        """
+        result = yield from self.relax(points, points)
+        known = result.bound if bounds is None else np.maximum(result.bound, bounds)
+        for i, point in enumerate(points):
+            self.seen.add(point.tobytes())
+            self.offer(result, i)
+            self.discard(float(min(known[i], result.snapped[i])))
+        return result
+
+    def lower_model(self, result: Relaxations, lane: int, lower: np.ndarray, upper: np.ndarray) -> LowerModel:
+        """The quadratic lower bound over the whole moves that a relaxed solve within these limits proves."""
+        c = self.constants
+        center = result.x[lane, c.integer]
+        slope = result.gradient[lane, c.integer]
+        width = int((upper - lower).max(initial=0)) + 1
+        values = lower[:, None] + np.arange(width)[None, :]
+        least = np.minimum(slope * (lower - center), slope * (upper - center))
+        excess = slope[:, None] * (values - center[:, None]) - least[:, None]
+        if c.levels:
+            price = result.envelope[lane].reshape(c.levels, -1)
+            knot, steep = c.knot.reshape(c.levels, -1), c.slope.reshape(c.levels, -1)
+            for m in range(c.levels):
+                own = steep[m][:, None] * np.maximum(np.abs(values) - knot[m][:, None], 0.0)
+                excess += own - price[m][:, None] * values + (knot[m] * np.abs(price[m]))[:, None]
+        excess = np.where(values <= upper[:, None], np.maximum(excess, 0.0), np.inf)
+        value = float(result.bound[lane])
+        return LowerModel(value, center, lower, upper, excess, c.schur, c.radius, c.order, c.leading)
+
+    # ---- incumbents
+    def rounded(self, moves: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray | None:
+        """Whole moves near `moves` that satisfy the hard rows, or None where there are none; see `nearest`."""
+        point = np.clip(whole(moves), lower, upper)
+        if satisfied(self.chains, point[None], lower, upper)[0]:
+            return point
+        point = nearest(self.chains, moves, lower, upper)
+        return point if point is not None and satisfied(self.chains, point[None], lower, upper)[0] else None
+
+    def new(self, points: Sequence[np.ndarray | None]) -> np.ndarray:
+        """The points that have not been evaluated yet, each once, ``"point integer"``."""
+        fresh = {p.tobytes(): p for p in points if p is not None and p.tobytes() not in self.seen}
+        return np.array(list(fresh.values())).reshape(len(fresh), len(self.constants.integer))
+
+    # ---- finishing
+    def finish(self, by: str | None, bound: float) -> SearchResult:
+        """Assemble the result; `bound` is the least bound of what is still open."""
+        bound = min(max(min(self.left_out, bound), self.root_bound), self.value)
+        if self.x is None:
+            status = INFEASIBLE if by is not None else FAILED
+            return SearchResult(None, np.inf, np.inf if by else bound, status, by, self.nodes)
+        closed = closes(self.value, bound, self.constants.scale, self.gap)
+        status, by = (OPTIMAL, by) if closed else (LIMIT, None)
+        return SearchResult(self.x, self.value, bound, status, by, self.nodes, self.start)

@@ -1,0 +1,240 @@
+"""Lists of whole moves in a compiled program: all that a quadratic lower bound leaves below a cutoff.
+
+A list is an array of codes with two bits per move, in the order in which the moves are assigned, block by block; moves
+are of one step at most. `compiled_search` solves the best of a list; `levelset` makes lists on the host.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxmpc.integer.constants import Constants
+from jaxmpc.integer.lower_bound import assignment_order
+from jaxmpc.problem.blocking import first_position_rows, moves_per_block, oscillation_rows
+from jaxmpc.problem.condense import QpInstance, integer_columns
+from jaxmpc.problem.structure import Structure
+
+LONGEST = 4096  # moves on a list; longer lists are left to the host
+GRID_FREE = 5  # free moves up to which all combinations are looked at
+BLOCK = 32  # entries of a list that are extended together
+STEPS = np.array([0.0, 1.0, -1.0])  # of one move; their codes are 0, 1, 3
+
+
+class Tables(eqx.Module):
+    """Constants of a scenario that the search reads, integer moves in the order in which they are assigned.
+
+    Attributes:
+        radius, leading: as in `levelset.LowerModel`.
+        root: factor of the curvature, `levelset.root_factor`.
+        slope, knot: of the envelope of every move.
+        own_weight: see `cuts`.
+        scale: see `gap.closes`.
+    """
+
+    radius: Float[np.ndarray, " integer"]
+    leading: Float[np.ndarray, "integer integer"]
+    root: Float[np.ndarray, "integer integer"]
+    slope: Float[np.ndarray, "level integer"]
+    knot: Float[np.ndarray, "level integer"]
+    own_weight: Float[np.ndarray, " integer"]
+    scale: Float[np.ndarray, ""]
+
+    @classmethod
+    def of(cls, constants: Constants) -> Tables:
+        """Those of one scenario."""
+        c, order = constants, constants.order
+
+        def levels(values):
+            return values.reshape(c.levels, -1)[:, order] if c.levels else np.zeros((0, len(order)))
+
+        return cls(
+            radius=c.radius[order],
+            leading=c.leading,
+            root=c.root_factor[order],
+            slope=levels(c.slope),
+            knot=levels(c.knot),
+            own_weight=c.own_weight[order],
+            scale=np.asarray(c.scale),
+        )
+
+
+class Order(NamedTuple):
+    """Integer moves in the order in which they are assigned, from the structure alone.
+
+    Attributes:
+        order: their places among the integer moves.
+        columns: their places in x.
+        reach: ``"integer integer"``, row i gives the position of its MV after move i.
+        previous: row i picks the move before i of the same MV.
+        position: hard row of that position.
+        pair: hard row that couples the move to the one before it; -1 for none.
+    """
+
+    order: np.ndarray
+    columns: np.ndarray
+    reach: np.ndarray
+    previous: np.ndarray
+    position: np.ndarray
+    pair: np.ndarray
+
+
+@functools.lru_cache(maxsize=64)
+def order_of(structure: Structure) -> Order:
+    """That of a structure."""
+    mvs, blocks, counts = structure.integer_mvs, structure.block_count, moves_per_block(structure)
+    order = assignment_order(blocks, len(mvs))
+    chain, block = order // blocks, order % blocks
+    mine = chain[:, None] == chain[None, :]
+    earlier = block[None, :] <= block[:, None]
+    firsts = first_position_rows(structure)[np.asarray(mvs)]
+    pairs = oscillation_rows(structure)
+    row_of = np.full(blocks, -1)
+    row_of[np.argmax(pairs, axis=1)] = np.arange(len(pairs))
+    return Order(
+        order=order,
+        columns=integer_columns(structure)[order],
+        reach=(mine & earlier) * counts[block][None, :].astype(float),
+        previous=(mine & (block[None, :] == block[:, None] - 1)).astype(float),
+        position=firsts[chain] + block,
+        pair=np.where(row_of[block] < 0, -1, firsts[chain] + blocks + row_of[block]),
+    )
+
+
+class LowerBound(NamedTuple):
+    """The root's quadratic lower bound, see `levelset.LowerModel`; `excess` has one column per entry of `STEPS`."""
+
+    value: Array
+    center: Array
+    excess: Array
+
+
+class PositionLimits(NamedTuple):
+    """Limits of the positions after every move, and whether a move may differ from the last by one step at most."""
+
+    low: Array
+    high: Array
+    coupled: Array
+
+
+def position_limits(order: Order, instance: QpInstance) -> PositionLimits:
+    """Those of one sample."""
+    return PositionLimits(
+        low=jnp.round(instance.row_low[order.position]),
+        high=jnp.round(instance.row_high[order.position]),
+        coupled=jnp.isfinite(instance.row_high[order.pair]) & (order.pair >= 0),
+    )
+
+
+def fits(
+    order: Order, limits: PositionLimits, points: Float[Array, "point integer"]
+) -> Bool[Array, " point"]:
+    """Whether whole moves satisfy the hard rows."""
+    position, before = points @ order.reach.T, points @ order.previous.T
+    good = (position >= limits.low) & (position <= limits.high)
+    return jnp.all(good & (~limits.coupled | (jnp.abs(points - before) <= 1.0)), axis=1)
+
+
+class Listed(NamedTuple):
+    """Whole moves with a bound below a cutoff; `count` may be more than the arrays hold, which then hold too few."""
+
+    codes: Array
+    bounds: Array
+    count: Array
+
+    @classmethod
+    def empty(cls) -> Listed:
+        """Nothing is left."""
+        return cls(jnp.zeros(LONGEST, dtype=int), jnp.full(LONGEST, jnp.inf), jnp.zeros((), dtype=int))
+
+
+def encode(points: Float[Array, "*point integer"]) -> Int[Array, "*point"]:
+    """Codes of whole moves."""
+    shifts = 2 * np.arange(points.shape[-1])
+    return jnp.sum((points.astype(int) & 3) << shifts, axis=-1)
+
+
+def decode(codes: Int[Array, "*point"], moves: int) -> Float[Array, "*point integer"]:
+    """Whole moves of codes."""
+    digits = (codes[..., None] >> (2 * np.arange(moves))) & 3
+    return jnp.where(digits == 3, -1, digits).astype(float)
+
+
+def grid_below(
+    order: Order, tables: Tables, limits: PositionLimits, model: LowerBound, sizes, cutoff
+) -> Listed:
+    """All combinations of a few free moves."""
+    left = jnp.isfinite(model.excess)
+    free = sizes > 1
+    rank = jnp.clip(jnp.cumsum(free) - 1, 0, GRID_FREE)
+    powers = jnp.asarray(3 ** np.arange(GRID_FREE + 1))
+    digit = (np.arange(3**GRID_FREE)[:, None] // powers[rank]) % 3
+    # a move that is not free has one value, which is the first of those that are left
+    only = jnp.argmax(left, axis=1)
+    digit = jnp.where(free, digit, only)
+    points = jnp.asarray(STEPS)[digit]
+    own = jnp.sum(jnp.select([digit == k for k in range(3)], list(model.excess.T)), axis=1)
+    away = (points - model.center) @ tables.leading.T
+    bounds = model.value + own + 0.5 * jnp.sum(away**2, axis=1)
+    used = np.arange(3**GRID_FREE) < powers[jnp.minimum(jnp.sum(free), GRID_FREE)]
+    bounds = jnp.where(used & fits(order, limits, points) & (bounds < cutoff), bounds, jnp.inf)
+    rest = LONGEST - len(points)
+    return Listed(
+        jnp.pad(encode(points), (0, rest)),
+        jnp.pad(bounds, (0, rest), constant_values=np.inf),
+        jnp.asarray(len(points)),
+    )
+
+
+def list_below(order: Order, tables: Tables, limits: PositionLimits, model: LowerBound, cutoff) -> Listed:
+    """Breadth-first search, move by move; `BLOCK` partial assignments at a time get their next move."""
+    moves, room = len(order.columns), LONGEST + 3 * BLOCK
+    reach, previous, leading = (jnp.asarray(v) for v in (order.reach, order.previous, tables.leading))
+
+    def assign(carry):
+        i, codes, bounds, count = carry
+        now, then = i % 2, (i + 1) % 2
+        row = leading[i]
+        shift = row @ model.center
+        pick = jnp.stack([row, reach[i], previous[i]], axis=1)  # of the moves before, this one still zero
+        step, place = row[i] * STEPS - shift, reach[i, i] * STEPS
+
+        def extend(carry):
+            begin, codes, bounds, found = carry
+            parents = jax.lax.dynamic_slice(codes, (now, begin), (1, BLOCK))[0]
+            before = jax.lax.dynamic_slice(bounds, (now, begin), (1, BLOCK))[0]
+            there = begin + np.arange(BLOCK) < count
+            term, position, last = (decode(parents, moves) @ pick).T[:, :, None]
+            total = before[:, None] + 0.5 * (term + step) ** 2 + model.excess[i]
+            reached = position + place
+            good = (reached >= limits.low[i]) & (reached <= limits.high[i]) & there[:, None]
+            good &= ~limits.coupled[i] | (jnp.abs(STEPS - last) <= 1.0)
+            alive = (good & (total < cutoff)).reshape(-1)
+            ranks = jnp.cumsum(alive)
+            # the k-th that is alive comes k-th
+            source = jnp.searchsorted(ranks, np.arange(1, 3 * BLOCK + 1), method="compare_all")
+            source = jnp.minimum(source, 3 * BLOCK - 1)
+            children = parents[:, None] | (jnp.asarray([0, 1, 3]) << (2 * i))
+            codes = jax.lax.dynamic_update_slice(codes, children.reshape(-1)[source][None], (then, found))
+            bounds = jax.lax.dynamic_update_slice(bounds, total.reshape(-1)[source][None], (then, found))
+            return begin + BLOCK, codes, bounds, jnp.minimum(found + ranks[-1], LONGEST + 1)
+
+        _, codes, bounds, found = jax.lax.while_loop(
+            lambda carry: (carry[0] < count) & (carry[3] <= LONGEST), extend, (0, codes, bounds, 0)
+        )
+        return i + 1, codes, bounds, jnp.asarray(found)
+
+    codes = jnp.zeros((2, room), dtype=int)
+    bounds = jnp.full((2, room), jnp.inf).at[0, 0].set(model.value)
+    _, codes, bounds, count = jax.lax.while_loop(
+        lambda carry: (carry[0] < moves) & (carry[3] <= LONGEST), assign, (0, codes, bounds, jnp.asarray(1))
+    )
+    end = moves % 2
+    there = np.arange(LONGEST) < count
+    return Listed(codes[end, :LONGEST], jnp.where(there, bounds[end, :LONGEST], jnp.inf), count)

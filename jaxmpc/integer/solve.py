@@ -1,0 +1,298 @@
+"""Exact whole moves (thesis 6.1, 6.5, 6.6): relaxation, fixing, enumeration under cuts, HiGHS, branch and bound.
+
+The line of a solve: one tight relaxation bounds the problem and nearly always finds whole moves by itself; otherwise its
+moves are rounded and solved, for an incumbent and a quadratic cut; prices fix every move that cannot improve on it;
+what is left is listed and pruned by cuts of the best candidates; where the list is too long, the shifted previous
+plan and the best moves by the prices are tried, and a reduced MILP, or branch and bound over batched relaxations, closes
+the rest. Every path ends with the same certificate:
+incumbent, lower bound, gap. `plan` and the mixed-integer controllers call this for one step or many side by side.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+
+from jaxmpc.integer.branch_and_bound import branch_and_bound
+from jaxmpc.integer.constants import Constants
+from jaxmpc.integer.cuts import Cuts
+from jaxmpc.integer.enumeration import enumerate_all
+from jaxmpc.integer.feasible import UndecidedError, propagate, satisfied, whole
+from jaxmpc.integer.host_search import GROUP, Search, SearchResult, Steps
+from jaxmpc.integer.lower_bound import LowerModel, enumerate_below, exclude
+from jaxmpc.integer.outer_approximation import outer_approximation
+from jaxmpc.integer.relaxer import Relaxations, Relaxer
+from jaxmpc.integer.scheduling import run
+from jaxmpc.problem.blocking import first_position_rows, moves_per_block
+from jaxmpc.problem.condense import QpInstance
+from jaxmpc.problem.structure import Structure
+from jaxmpc.relaxed.gap import closes
+from jaxmpc.relaxed.newton import WarmStart
+from jaxmpc.status import FINISHERS, INFEASIBLE, OPTIMAL
+
+BEAM = 64  # partial candidates kept while looking for good first moves
+HIGHS_SECONDS = 0.1  # what the reduced MILP may take before branch and bound closes the rest
+UNINTERRUPTED = 0.05  # time limits from which on a search may run as one compiled call [s]
+FINISHES = ("auto", "enumeration", "highs", "branch-and-bound")
+
+
+def solve_integer(
+    constants: Constants,
+    instance: QpInstance,
+    *,
+    starts: list[np.ndarray] | None = None,
+    warm: WarmStart | None = None,
+    gap: float = 1e-6,
+    time_limit: float | None = None,
+    finish: str = "auto",
+) -> SearchResult:
+    """Solve one problem with whole moves exactly.
+
+    Args:
+        constants: of the structure, model and tuning.
+        instance: the problem of this sample.
+        starts: moves of integer MVs to try as incumbents ``"integer"`` [steps]; rounded here.
+        warm: prices of a neighbouring problem's root relaxation; speeds the solve up, never changes the answer.
+        gap: relative gap at which the solve stops.
+        time_limit: seconds; the best plan so far is returned with its true gap.
+        finish: ``auto``, or the one path that has to close the problem after fixing.
+
+    Returns:
+        `SearchResult`; ``status.INFEASIBLE`` when no whole moves satisfy the hard limits.
+    """
+    one = lambda tree: jax.tree.map(lambda leaf: leaf[None], tree)  # noqa: E731
+    return solve_integers(
+        Relaxer([constants]),
+        one(instance),
+        starts=[starts or []],
+        warm=one(constants.cold if warm is None else warm),
+        gap=gap,
+        time_limit=time_limit,
+        finish=finish,
+    )[0][0]
+
+
+def solve_integers(
+    relaxer: Relaxer,
+    instances: QpInstance,
+    *,
+    starts: list[list[np.ndarray]],
+    warm: WarmStart | None = None,
+    root: Relaxations | None = None,
+    gap: float = 1e-6,
+    time_limit: float | None = None,
+    finish: str = "auto",
+    which: Sequence[int] | np.ndarray | None = None,
+    searched: bool = False,
+) -> tuple[list[SearchResult], Relaxations]:
+    """Solve the problems of many scenarios side by side; arguments as in `solve_integer`, with a scenario axis.
+
+    Args:
+        relaxer: compiled relaxations of the scenarios.
+        instances: their problems.
+        starts: incumbents to try, per scenario.
+        warm: where each root relaxation starts.
+        root: the root relaxations where they are known already, in place of `warm`.
+        gap: relative gap.
+        time_limit: seconds of work per scenario.
+        finish: path that has to close the problems.
+        which: scenarios to solve; all if not given.
+        searched: whether the compiled search has been tried.
+
+    Returns:
+        ``(results, roots)``: one result per scenario that was to be solved, and the solved relaxations of all.
+    """
+    count = len(instances.lower)
+    begin, compiled = time.perf_counter(), relaxer.compiling
+    if root is None:
+        root = relaxer.solve_roots(instances, relaxer.fitting(warm, count))
+    seconds = time.perf_counter() - begin - (relaxer.compiling - compiled)
+    results: list[SearchResult | None] = [None] * count
+    waiting, open_searches = [], []
+    for i in range(count) if which is None else which:
+        bound, value = max(float(root.bound[i]), 0.0), float(root.snapped[i])
+        if finish == "auto" and closes(value, bound, relaxer.scenario(i).scale, gap):
+            results[i] = _closed_by_root(relaxer, root, i, bound, seconds / count)
+            continue
+        waiting.append(i)
+    if waiting and not searched and compiles(relaxer, finish, time_limit):
+        _decided_at_once(relaxer, instances, np.asarray(waiting), root, gap, seconds / count, results)
+    for i in [i for i in waiting if results[i] is None]:
+        own = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], instances)
+        search = Search(relaxer.scenario(i), own, root.part(i, i + 1), gap, time_limit)
+        search.spent = seconds / count
+        open_searches.append((i, search, _line(search, starts[i], finish)))
+    if open_searches:
+        done = run(relaxer, instances, open_searches)
+        for (i, search, _), result in zip(open_searches, done, strict=True):
+            result.seconds = search.spent
+            results[i] = result
+    return [result for result in results if result is not None], root
+
+
+def compiles(relaxer: Relaxer, finish: str, time_limit: float | None) -> bool:
+    """Whether searches may run in one compiled call, which nothing interrupts."""
+    unhurried = time_limit is None or time_limit >= UNINTERRUPTED
+    return finish == "auto" and unhurried and relaxer.tables is not None
+
+
+def _decided_at_once(
+    relaxer: Relaxer,
+    instances: QpInstance,
+    index: np.ndarray,
+    root: Relaxations,
+    gap: float,
+    spent: float,
+    results: list[SearchResult | None],
+) -> None:
+    """Results of the searches that one compiled call closes; they share its time by the relaxations they solved."""
+    begin, compiled = time.perf_counter(), relaxer.compiling
+    found = relaxer.decide(instances, index, root, gap)
+    seconds = time.perf_counter() - begin - (relaxer.compiling - compiled)
+    share = seconds * found.nodes / found.nodes.sum()
+    for lane, i in enumerate(index):
+        if found.closed[lane]:
+            results[i] = SearchResult(
+                np.asarray(found.x[lane]),
+                float(found.value[lane]),
+                float(found.bound[lane]),
+                OPTIMAL,
+                FINISHERS[int(found.finished_by[lane])],
+                int(found.nodes[lane]),
+                root.start(i),
+                spent + float(share[lane]),
+            )
+
+
+def _closed_by_root(
+    relaxer: Relaxer, root: Relaxations, lane: int, bound: float, seconds: float
+) -> SearchResult:
+    """The root's own moves are whole: nothing to search."""
+    x = root.x[lane].copy()
+    x[relaxer.integer] = np.round(x[relaxer.integer])
+    value = float(root.snapped[lane])
+    return SearchResult(x, value, min(bound, value), OPTIMAL, "relaxation", 1, root.start(lane), seconds)
+
+
+def _line(search: Search, starts: list[np.ndarray], finish: str) -> Steps:
+    """The whole line of one solve, from its relaxation on; returns `SearchResult`."""
+    c, root, root_bound = search.constants, search.root, search.root_bound
+    integer = c.integer
+    low, high = whole(search.limits[0][integer]), whole(search.limits[1][integer])
+    infeasible = SearchResult(None, np.inf, np.inf, INFEASIBLE, None, 0)
+    if not (np.isfinite(root.x).all() and np.isfinite(root.bound).all()):
+        return search.finish(None, root_bound)
+    model, lower, upper = search.lower_model(root, 0, low, high), low, high
+    point = np.clip(whole(model.center), low, high)
+    if not satisfied(search.chains, point[None], low, high)[0]:
+        lower, upper, possible = (part[0] for part in propagate(search.chains, low[None], high[None]))
+        try:
+            point = _repaired(search, model, lower, upper) if possible else None
+        except UndecidedError:
+            return search.finish(None, root_bound)
+        if point is None:
+            return infeasible
+    cuts = Cuts(c)
+    cuts.add(root, 0, low, high)
+    search.offer(root, 0)
+    yield from _solve_all(search, cuts, [point])
+    if not np.isfinite(search.value) and not continuous_feasible(c.structure, search.instance):
+        return infeasible
+    if finish == "auto" and root_bound >= search.cutoff:
+        return search.finish("relaxation", root_bound)
+    if search.out_of_time():
+        return search.finish(None, root_bound)
+    if np.isfinite(search.value):
+        kept_low, kept_high = exclude(model, search.cutoff)
+        lower, upper = np.maximum(lower, kept_low), np.minimum(upper, kept_high)
+        lower, upper, possible = propagate(search.chains, lower[None], upper[None])
+        lower, upper = lower[0], upper[0]
+        search.discard(max(root_bound, search.cutoff))
+        if not possible[0]:
+            return search.finish("fixing" if finish == "auto" else finish, np.inf)
+        if (lower == upper).all() and finish == "auto":
+            last = search.new([lower])
+            if len(last):
+                yield from search.evaluate(last)
+            return search.finish("fixing", np.inf)
+    if finish in ("auto", "enumeration"):
+        limited = finish == "auto"
+        done = yield from enumerate_all(search, model, cuts, lower, upper, limited=limited)
+        if not done and not search.out_of_time():  # better incumbents make the list shorter
+            yield from _solve_all(search, cuts, _candidates(search, model, starts, lower, upper))
+            done = yield from enumerate_all(search, model, cuts, lower, upper, limited=limited)
+        if done or finish == "enumeration" or search.out_of_time():
+            return search.finish("enumeration" if done else None, np.inf if done else root_bound)
+    if finish in ("auto", "highs"):
+        seconds = search.seconds_left()
+        if finish == "auto":
+            seconds = HIGHS_SECONDS if seconds is None else min(seconds, HIGHS_SECONDS)
+        done, bound = yield from outer_approximation(search, model, cuts, lower, upper, seconds)
+        root_bound = max(root_bound, min(bound, search.value))
+        if done or finish == "highs" or search.out_of_time():
+            return search.finish("highs" if done else None, root_bound)
+    bound = yield from branch_and_bound(search, root, model, lower, upper, root_bound)
+    return search.finish("branch-and-bound", bound)
+
+
+def _solve_all(search: Search, cuts: Cuts, points: Sequence[np.ndarray]) -> Steps:
+    """Solve whole moves that are new, each for an incumbent and a cut."""
+    fresh = search.new(points)
+    if len(fresh):
+        result = yield from search.evaluate(fresh)
+        for lane, point in enumerate(fresh):
+            cuts.add(result, lane, point, point)
+
+
+def _repaired(search: Search, model: LowerModel, lower: np.ndarray, upper: np.ndarray) -> np.ndarray | None:
+    """Where the rounded relaxation breaks a hard row: the best moves by the model, None if there are none at all."""
+    by_model = _best_by_model(search, model, lower, upper)
+    if len(by_model):
+        return by_model[0]
+    for wanted in (model.center, np.zeros(len(lower))):
+        repaired = search.rounded(wanted, lower, upper)
+        if repaired is not None:
+            return repaired
+    return None
+
+
+def _best_by_model(search: Search, model: LowerModel, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Whole moves that satisfy the hard rows, the cheapest by the model first, ``"point integer"``."""
+    found = enumerate_below(model, search.chains, lower, upper, np.inf, None, beam=BEAM)
+    points = np.zeros((0, len(lower)), dtype=int) if found is None else found[0]
+    return points[satisfied(search.chains, points, lower, upper)]
+
+
+def _candidates(
+    search: Search, model: LowerModel, starts: list[np.ndarray], lower: np.ndarray, upper: np.ndarray
+) -> list[np.ndarray]:
+    """Whole moves that may be good: starts, no moves, and the best by the model."""
+    simple = [np.clip(whole(w), lower, upper) for w in (*starts, np.zeros(len(lower)))]
+    fit = [point for point in simple if satisfied(search.chains, point[None], lower, upper)[0]]
+    return (fit + list(_best_by_model(search, model, lower, upper)))[:GROUP]
+
+
+def continuous_feasible(structure: Structure, instance: QpInstance) -> bool:
+    """Whether the limits of the continuous MVs leave any moves at all (exact, by reachable positions)."""
+    lower, upper = np.asarray(instance.lower), np.asarray(instance.upper)
+    counts = moves_per_block(structure)
+    blocks, firsts = structure.block_count, first_position_rows(structure)
+    row_low, row_high = np.asarray(instance.row_low), np.asarray(instance.row_high)
+    slack = 1e-7
+    for mv in range(structure.mv_count):
+        if mv in structure.integer_mvs:
+            continue
+        own_low, own_high = lower[mv * blocks : (mv + 1) * blocks], upper[mv * blocks : (mv + 1) * blocks]
+        if (own_low > own_high + slack).any():
+            return False
+        first = firsts[mv]
+        least = most = 0.0
+        for b in range(blocks):
+            least = max(least + counts[b] * own_low[b], row_low[first + b])
+            most = min(most + counts[b] * own_high[b], row_high[first + b])
+            if least > most + slack:
+                return False
+    return True

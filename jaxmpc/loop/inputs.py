@@ -1,0 +1,164 @@
+"""What goes into closed loops, checked before anything runs: for one run, and for all lanes of a sweep.
+
+`jaxmpc.loop.simulate` is the only caller. A sweep stays on the host; the loop takes some lanes at a time from it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxmpc.controller.batch import Lanes, for_all
+from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.mixed_integer import MixedIntegerControllers
+from jaxmpc.errors import InputError
+from jaxmpc.loop.noise import check_deviation, check_seed
+from jaxmpc.loop.reference import Reference
+from jaxmpc.problem.structure import Structure
+from jaxmpc.process.plant import WellPlant
+
+
+def check_match(structure: Structure, plant) -> None:
+    """Refuse a plant whose sampling interval is not the controller's."""
+    if abs(plant.dt - structure.dt) > 1e-9 * structure.dt:
+        raise InputError("plant.dt", plant.dt, f"the controller's sampling interval {structure.dt} s")
+
+
+def sampled(reference: Reference, structure: Structure, samples: int | None) -> np.ndarray:
+    """Setpoints ``"sample cv"`` of a run, refused where the reference does not fit."""
+    if reference.cv_count != structure.cv_count:
+        raise InputError(
+            "reference.setpoints",
+            f"{reference.cv_count} columns",
+            f"one per CV: {', '.join(structure.cv_names)}",
+        )
+    return reference.sample(structure.dt, samples)
+
+
+def check_offsets(offsets: np.ndarray, *shapes: tuple[int, ...]) -> None:
+    """Refuse pressure offsets [bar] of another shape, and those that are not finite."""
+    if offsets.shape not in shapes or not np.isfinite(offsets).all():
+        raise InputError(
+            "disturbance",
+            f"shape {list(offsets.shape)}",
+            f"{' or '.join(str(list(shape)) for shape in shapes)} finite offsets [bar], one per sample",
+        )
+
+
+def check_faults(faults: np.ndarray, *shapes: tuple[int, ...]) -> None:
+    """Refuse errors of sensors [CV unit] of another shape."""
+    if faults.shape not in shapes:
+        expected = " or ".join(str(list(shape)) for shape in shapes)
+        raise InputError("faults", f"shape {list(faults.shape)}", f"{expected} errors, one per sample and CV")
+
+
+def _structure(controllers: Lanes[ContinuousController] | MixedIntegerControllers) -> Structure:
+    lanes = isinstance(controllers, Lanes)
+    return controllers.shared.structure if lanes else controllers.structure
+
+
+def _hides_lanes(controllers: Lanes[ContinuousController]) -> bool:
+    """Whether arrays that count as shared have a lane axis."""
+    shared = controllers.each.tuning.bias_cutoff is None
+    return shared and np.ndim(controllers.value.tuning.bias_cutoff) > 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep:
+    """All lanes of a sweep on the host, checked."""
+
+    controllers: Lanes[ContinuousController] | MixedIntegerControllers
+    plants: Lanes[WellPlant]
+    setpoints: Sequence[np.ndarray]  # one for all, or one per lane
+    offsets: np.ndarray  # "sample" or "lane sample"
+    deviation: np.ndarray  # "lane cv"
+    seeds: np.ndarray  # "lane 2": seed and stream
+    faults: np.ndarray  # "sample cv" or "lane sample cv"
+    position_feedback: np.ndarray  # "lane"
+    samples: int
+    count: int
+
+    @property
+    def structure(self) -> Structure:
+        """Of the controllers, the same in every lane."""
+        return _structure(self.controllers)
+
+    @classmethod
+    def checked(
+        cls, controllers, plants, reference, samples, disturbance, noise, seed, faults, position_feedback
+    ) -> Sweep:
+        """The sweep, or an `InputError` that names what does not fit."""
+        if not isinstance(controllers, (Lanes, MixedIntegerControllers)):
+            controllers = for_all(controllers)
+        plants = plants if isinstance(plants, Lanes) else for_all(plants)
+        if isinstance(controllers, Lanes) and _hides_lanes(controllers):
+            raise InputError(
+                "controllers", "arrays with a lane axis", "Lanes", "Wrap a batch of your own in `per_lane`"
+            )
+        structure = _structure(controllers)
+        check_match(structure, plants.shared)
+        own_references = not isinstance(reference, Reference)
+        references = list(reference) if own_references else [reference]
+        if samples is None and references:
+            samples = min(r.samples(structure.dt) for r in references)
+        setpoints = [sampled(r, structure, samples) for r in dict.fromkeys(references)]
+        by_reference = dict(zip(dict.fromkeys(references), setpoints, strict=True))
+        setpoints = [by_reference[r] for r in references]
+        offsets = np.zeros(samples or 0) if disturbance is None else np.asarray(disturbance, dtype=np.float64)
+        shape = (samples or 0, structure.cv_count)
+        failing = np.zeros(shape) if faults is None else np.asarray(faults, dtype=np.float64)
+        told = np.asarray(position_feedback)
+        if told.ndim > 1 or told.dtype != np.bool_:
+            raise InputError("position_feedback", position_feedback, "true or false, or one of them per lane")
+        deviation, seed = check_deviation(noise, structure.cv_count), check_seed(seed)
+        counts = {
+            "controllers": controllers.count,
+            "plants": plants.count,
+            "reference": len(references) if own_references else None,
+            "disturbance": len(offsets) if offsets.ndim == 2 else None,
+            "noise": len(deviation) if deviation.ndim == 2 else None,
+            "seed": len(seed) if seed.ndim else None,
+            "faults": len(failing) if failing.ndim == 3 else None,
+            "position_feedback": len(told) if told.ndim else None,
+        }
+        given = {name: count for name, count in counts.items() if count is not None}
+        if len(set(given.values())) != 1 or not min(given.values()):
+            raise InputError(
+                "lanes", given or "none", "one number of lanes, 1 or more, in all that has lanes"
+            )
+        count = next(iter(given.values()))
+        check_offsets(offsets, (len(setpoints[0]),), (count, len(setpoints[0])))
+        check_faults(failing, setpoints[0].shape, (count, *setpoints[0].shape))
+        stream = np.arange(count) if seed.ndim == 0 else np.zeros(count)
+        return cls(
+            controllers=controllers,
+            plants=plants,
+            setpoints=setpoints,
+            offsets=offsets,
+            deviation=np.broadcast_to(deviation, (count, structure.cv_count)),
+            seeds=np.stack([np.broadcast_to(seed, count), stream], axis=1).astype(np.int64),
+            faults=failing,
+            position_feedback=np.broadcast_to(told, count),
+            samples=len(setpoints[0]),
+            count=count,
+        )
+
+    def setpoints_of(self, index: np.ndarray) -> np.ndarray:
+        """Setpoints "lane sample cv" of some lanes; no copies where all are the same."""
+        if len(self.setpoints) == 1:
+            return np.broadcast_to(self.setpoints[0], (len(index), *self.setpoints[0].shape))
+        return np.stack([self.setpoints[k] for k in index])
+
+    def offsets_of(self, index: np.ndarray) -> np.ndarray:
+        """Pressure offsets "lane sample" of some lanes [bar]."""
+        if self.offsets.ndim == 1:
+            return np.broadcast_to(self.offsets, (len(index), self.samples))
+        return self.offsets[index]
+
+    def faults_of(self, index: np.ndarray) -> np.ndarray:
+        """Errors of the sensors "lane sample cv" of some lanes [CV unit]."""
+        if self.faults.ndim == 2:
+            return np.broadcast_to(self.faults, (len(index), *self.faults.shape))
+        return self.faults[index]

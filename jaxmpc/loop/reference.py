@@ -1,0 +1,127 @@
+"""Setpoints over time (thesis 7): piecewise constant, all CVs together, checked before a run starts.
+
+`jaxmpc.loop.simulate.simulate` samples it; studies define it and cut their key figures at its changes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from jaxmpc.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Reference:
+    """Setpoints that change at given times and hold until the next change; checked on construction.
+
+    Attributes:
+        times: ``"change"``, when the setpoints change [s]: increasing, from 0, all before `duration`.
+        setpoints: ``"change cv"``, one row per change, in CV order [CV unit].
+        duration: length of the run [s].
+
+    Raises:
+        InputError: naming the field, for wrong shapes, fewer setpoints than times, NaN, unsorted times, a
+            first change after 0 or a change that the run never reaches.
+    """
+
+    times: Any
+    setpoints: Any
+    duration: float
+
+    def __post_init__(self):
+        times = _numbers("reference.times", self.times, 1, "change times [s]")
+        setpoints = _numbers(
+            "reference.setpoints", self.setpoints, 2, "one row per change, one column per CV"
+        )
+        if len(times) == 0 or times[0] != 0:
+            raise InputError(
+                "reference.times[0]",
+                times[0] if len(times) else "nothing",
+                "0 s: the setpoints must be known from the start of the run",
+            )
+        if len(setpoints) != len(times):
+            raise InputError(
+                "reference.setpoints", f"{len(setpoints)} rows", f"{len(times)} rows, one per change time"
+            )
+        if setpoints.shape[1] == 0:
+            raise InputError("reference.setpoints", f"shape {list(setpoints.shape)}", "at least one CV")
+        early = np.flatnonzero(np.diff(times) <= 0)
+        if early.size:
+            i = int(early[0]) + 1
+            raise InputError(
+                f"reference.times[{i}]", times[i], f"a time after the change before it, {times[i - 1]:g} s"
+            )
+        duration = self.duration
+        if isinstance(duration, bool) or not isinstance(duration, (int, float)) or not np.isfinite(duration):
+            raise InputError("reference.duration", duration, "a finite length of the run [s]")
+        if duration <= times[-1]:
+            raise InputError(
+                "reference.duration", duration, f"more than the last change time, {times[-1]:g} s"
+            )
+        times.setflags(write=False)
+        setpoints.setflags(write=False)
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "setpoints", setpoints)
+        object.__setattr__(self, "duration", float(duration))
+
+    @classmethod
+    def from_samples(cls, setpoints, dt: float) -> Reference:
+        """The reference that has row k of `setpoints` (``"sample cv"``) from k dt to (k + 1) dt [s]."""
+        setpoints = _numbers("reference.setpoints", setpoints, 2, "one row per sample, one column per CV")
+        changed = np.r_[True, np.any(np.diff(setpoints, axis=0) != 0, axis=1)][: len(setpoints)]
+        starts = np.flatnonzero(changed)
+        return cls(starts * float(dt), setpoints[starts], len(setpoints) * float(dt))
+
+    @property
+    def cv_count(self) -> int:
+        """Number of CVs."""
+        return self.setpoints.shape[1]
+
+    def samples(self, dt: float) -> int:
+        """Whole samples of `dt` [s] in the run."""
+        if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not np.isfinite(dt) or dt <= 0:
+            raise InputError("dt", dt, "a positive sampling interval [s]")
+        return int(np.floor(self.duration / dt + 1e-9))
+
+    def window(self, dt: float, samples: int | None = None) -> np.ndarray:
+        """Index of the setpoint row at each sample, ``"sample"``: the last change at or before k dt.
+
+        Args:
+            dt: sampling interval [s].
+            samples: how many; the whole run if not given.
+
+        Raises:
+            InputError: if the run is shorter than `samples`.
+        """
+        available = self.samples(dt)
+        samples = available if samples is None else samples
+        if samples > available:
+            raise InputError(
+                "reference.duration",
+                self.duration,
+                f"at least {samples * dt:g} s of setpoints for a run of {samples} samples of {dt:g} s",
+            )
+        time = np.arange(samples) * dt
+        return np.searchsorted(self.times, time + 1e-9 * dt, side="right") - 1
+
+    def sample(self, dt: float, samples: int | None = None) -> np.ndarray:
+        """Setpoints at every sample, ``"sample cv"`` [CV unit]; arguments and errors of `window`."""
+        return self.setpoints[self.window(dt, samples)]
+
+
+def _numbers(field: str, given, dimensions: int, expected: str) -> np.ndarray:
+    """A finite float array of so many dimensions, or an InputError that names the first bad entry."""
+    try:
+        array = np.array(given, dtype=np.float64)
+    except (ValueError, TypeError):
+        raise InputError(field, given, f"{expected}, rows of equal length") from None
+    if array.ndim != dimensions:
+        raise InputError(field, f"shape {list(array.shape)}", f"{dimensions} dimensions: {expected}")
+    bad = np.argwhere(~np.isfinite(array))
+    if len(bad):
+        where = tuple(int(i) for i in bad[0])
+        raise InputError(f"{field}{''.join(f'[{i}]' for i in where)}", array[where], "a finite number")
+    return array

@@ -1,0 +1,1 @@
+"""The gas-lifted well of the thesis."""

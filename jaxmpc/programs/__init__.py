@@ -1,0 +1,1 @@
+"""Compiled programs at the edge: their cache, threads, interrupts, packing."""

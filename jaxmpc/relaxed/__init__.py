@@ -1,0 +1,1 @@
+"""The relaxed problem and its certificate: Newton, bound and gap."""

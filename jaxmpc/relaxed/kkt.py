@@ -1,0 +1,247 @@
+"""How far a solution is from optimal: Karush-Kuhn-Tucker residuals of the relaxed problem (`condense`), per lane.
+
+Tests and benchmarks judge solvers with these, the library's own and foreign ones. They use the problem, the moves and the
+prices, and nothing that a solver says of itself: objective, bound and status are not looked at, and no helper
+of the solvers is called. The problem is
+
+    min  sum Q t^2 + sum P x^2 + sum_k soft_k(t_k) + sum_g rho_g max(0, violation_g),    t = theta x + t0,
+    lower <= x <= upper,    row_low <= W x <= row_high,
+
+with soft(t) = S e^2 + s e, e = max(|t| - c, 0), and one group g per CV and side. With a price v for every soft row, p for
+every CV limit, mu for every hard row and lambda for every limit of x, a solution has (Boyd and Vandenberghe 2004, 5.5.3)
+
+    2 theta'Q t + 2 P x + theta'(v + p) + W'mu + lambda = 0,   v in the subdifferential of soft(t), ...
+"""
+
+from __future__ import annotations
+
+import functools
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxmpc.problem.condense import CondensedQp, QpInstance
+from jaxmpc.programs.numerics import largest
+from jaxmpc.relaxed.problem import QpSolution
+
+LEAST_MOVE = 1e-3  # [scaled moves]: what smaller moves cost is no scale for a residual
+SMALLEST = 1e-300
+
+
+class KktResiduals(eqx.Module):
+    """Residuals of one lane, all relative and non-negative; not a number where the moves or prices are none.
+
+    Two scales serve all of them. The *force* scale is the largest gradient of any one term of the objective or any one
+    family of prices [objective per scaled move]; the *cost* scale is the objective. Neither is taken smaller than what a
+    move of `LEAST_MOVE` would cost by curvature, so that a problem whose optimum is zero has meaningful residuals.
+
+    Attributes:
+        stationarity: largest component of the Lagrangian's gradient, over the force scale.
+        primal: largest violation of the limits of x and of the hard rows, over max(1, |limit|).
+        dual: largest price of the wrong sign, at an infinite limit, beyond s of a row with S = 0, or beyond rho of its CV
+            and side, each as the force it exerts, over the force scale.
+        complementarity: largest product of price and distance to a limit, largest rho max(0, violation) - sum p violation
+            of a CV and side, largest soft(t) + soft*(v) - v t of a row (Fenchel-Young: zero if and only if v is in the
+            subdifferential at t), over the cost scale.
+        gap: distance between the objective and the dual objective of these prices (Wolfe), over the cost scale.
+    """
+
+    stationarity: Float[Array, ""]
+    primal: Float[Array, ""]
+    dual: Float[Array, ""]
+    complementarity: Float[Array, ""]
+    gap: Float[Array, ""]
+
+    @property
+    def worst(self) -> Float[Array, ""]:
+        """The largest of the five."""
+        parts = (self.stationarity, self.primal, self.dual, self.complementarity, self.gap)
+        return functools.reduce(jnp.maximum, parts)
+
+
+class _Prices(eqx.Module):
+    """One non-negative vector per family of inequalities if the signs are right; v keeps its sign."""
+
+    row: Array
+    high: Array
+    low: Array
+    lower: Array
+    upper: Array
+    row_low: Array
+    row_high: Array
+
+
+def kkt_residuals(
+    qp: CondensedQp,
+    rows: Float[Array, "hard n"] | np.ndarray,
+    instance: QpInstance,
+    solution: QpSolution,
+    lower: Float[Array, " n"] | None = None,
+    upper: Float[Array, " n"] | None = None,
+) -> KktResiduals:
+    """Residuals of one lane (use `jax.vmap` for a batch).
+
+    Args:
+        qp: constant part.
+        rows: hard rows, `blocking.hard_rows(structure)`.
+        instance: offsets and limits of this sample.
+        solution: its moves and prices; everything else in it is ignored.
+        lower, upper: limits of x that were solved for; the instance's if not given. Equal limits fix a move.
+    """
+    lower = instance.lower if lower is None else lower
+    upper = instance.upper if upper is None else upper
+    if not qp.has_limits:  # then the CV limits are no part of the problem
+        none = jnp.full_like(instance.limit_high, jnp.inf)
+        instance = eqx.tree_at(lambda i: (i.limit_high, i.limit_low), instance, (none, -none))
+    w_matrix, x = jnp.asarray(rows), solution.x
+    t, wx = qp.theta @ x + instance.offset, w_matrix @ x
+    prices = _Prices(
+        row=solution.row_price,
+        high=jnp.maximum(solution.limit_price, 0.0),
+        low=jnp.maximum(-solution.limit_price, 0.0),
+        lower=solution.lower_price,
+        upper=solution.upper_price,
+        row_low=solution.row_low_price,
+        row_high=solution.row_high_price,
+    )
+    objective = _objective(qp, instance, x, t)
+    flat = _cost_of_a_move(qp)
+    cost = jnp.maximum(jnp.abs(objective), flat * LEAST_MOVE**2) + SMALLEST
+    forces = _forces(qp, w_matrix, x, t, prices)
+    force = jnp.maximum(jnp.max(jnp.abs(forces)), flat * LEAST_MOVE) + SMALLEST
+    inequalities = (  # price, room to the limit, limit
+        (prices.lower, x - lower, lower),
+        (prices.upper, upper - x, upper),
+        (prices.row_low, wx - instance.row_low, instance.row_low),
+        (prices.row_high, instance.row_high - wx, instance.row_high),
+    )
+    products = [jnp.where(jnp.isfinite(limit), price * room, 0.0) for price, room, limit in inequalities]
+    return KktResiduals(
+        stationarity=_largest(jnp.sum(forces, axis=0)) / force,
+        primal=_largest(*(_over(room, limit) for _, room, limit in inequalities)),
+        dual=_dual_infeasibility(qp, w_matrix, instance, prices, lower, upper) / force,
+        complementarity=_largest(
+            *products, *_limit_products(qp, instance, t, prices), _fenchel_young(qp, t, prices.row)
+        )
+        / cost,
+        gap=jnp.abs(objective - _dual_objective(qp, instance, x, prices, lower, upper)) / cost,
+    )
+
+
+def _largest(*values):
+    """Largest magnitude in some vectors, 0 if all are empty."""
+    return largest(jnp.concatenate([jnp.atleast_1d(value) for value in values]))
+
+
+def _over(room, limit):
+    """Relative violation of limits; infinite ones hold."""
+    finite = jnp.isfinite(limit)
+    size = jnp.maximum(1.0, jnp.abs(jnp.where(finite, limit, 0.0)))
+    # a limit that is infinite on the wrong side (lower = inf) can never be met
+    return jnp.where(finite, jnp.maximum(-room, 0.0) / size, jnp.where(room < 0.0, jnp.inf, 0.0))
+
+
+def _soft(qp: CondensedQp, t):
+    beyond = jnp.maximum(jnp.abs(t) - qp.deadzone, 0.0)
+    return (qp.soft_quadratic * beyond + qp.soft_linear) * beyond
+
+
+def _soft_conjugate(qp: CondensedQp, price):
+    """soft*(v) = c|v| + max(|v| - s, 0)^2 / (4 S); prices that S = 0 forbids count as the largest it allows."""
+    bent = qp.soft_quadratic > 0.0
+    size = jnp.where(bent, jnp.abs(price), jnp.minimum(jnp.abs(price), qp.soft_linear))
+    beyond = jnp.maximum(size - qp.soft_linear, 0.0)
+    return qp.deadzone * size + beyond**2 / jnp.where(bent, 4.0 * qp.soft_quadratic, 1.0)
+
+
+def _fenchel_young(qp: CondensedQp, t, price):
+    allowed = jnp.where(qp.soft_quadratic > 0.0, price, jnp.clip(price, -qp.soft_linear, qp.soft_linear))
+    return _soft(qp, t) + _soft_conjugate(qp, price) - allowed * t
+
+
+def _per_group(qp: CondensedQp, values, reduce):
+    return reduce(values.reshape(qp.slack_weight.shape[0], -1), axis=1)
+
+
+def _limit_products(qp: CondensedQp, instance: QpInstance, t, prices: _Prices):
+    """Rho max(0, violation) - sum of price times violation, per CV, for the high and the low sides."""
+    y = t[: instance.limit_high.shape[0]]
+    found = []
+    for price, over in ((prices.high, y - instance.limit_high), (prices.low, instance.limit_low - y)):
+        paid = jnp.where(jnp.isfinite(over), price * over, 0.0)
+        worst = jnp.maximum(_per_group(qp, over, jnp.max), 0.0)
+        found.append(qp.slack_weight * worst - _per_group(qp, paid, jnp.sum))
+    return tuple(found)
+
+
+def _objective(qp: CondensedQp, instance: QpInstance, x, t):
+    value = jnp.sum(qp.quadratic * t**2) + jnp.sum(qp.move_weight * x**2) + jnp.sum(_soft(qp, t))
+    y = t[: instance.limit_high.shape[0]]
+    for over in (y - instance.limit_high, instance.limit_low - y):
+        value += qp.slack_weight @ jnp.maximum(_per_group(qp, over, jnp.max), 0.0)
+    return value
+
+
+def _dual_objective(qp: CondensedQp, instance: QpInstance, x, prices: _Prices, lower, upper):
+    """The Lagrangian less its gradient times x: the dual objective where the gradient vanishes."""
+    offset = instance.offset
+    y0 = offset[: instance.limit_high.shape[0]]
+    value = jnp.sum(qp.quadratic * (offset**2 - (qp.theta @ x) ** 2)) - jnp.sum(qp.move_weight * x**2)
+    value += jnp.sum(prices.row * offset - _soft_conjugate(qp, prices.row))
+    for price, constant in (
+        (prices.high, y0 - instance.limit_high),
+        (prices.low, instance.limit_low - y0),
+        (prices.lower, lower),
+        (prices.upper, -upper),
+        (prices.row_low, instance.row_low),
+        (prices.row_high, -instance.row_high),
+    ):
+        value += jnp.sum(jnp.where(jnp.isfinite(constant), price * constant, 0.0))
+    return value
+
+
+def _forces(qp: CondensedQp, w_matrix, x, t, prices: _Prices) -> Float[Array, "term n"]:
+    """Gradients in x of the terms of the Lagrangian, one row each; their sum is its gradient."""
+    net = prices.high - prices.low
+    return jnp.stack(
+        [
+            (2.0 * qp.quadratic * t) @ qp.theta,
+            2.0 * qp.move_weight * x,
+            prices.row @ qp.theta,
+            net @ qp.theta[: net.shape[0]],
+            (prices.row_high - prices.row_low) @ w_matrix,
+            prices.upper - prices.lower,
+        ]
+    )
+
+
+def _cost_of_a_move(qp: CondensedQp) -> Float[Array, ""]:
+    """What one scaled move costs at most, alone and away from every deadzone [objective]."""
+    theta = jnp.abs(qp.theta)
+    return jnp.max((qp.quadratic + qp.soft_quadratic) @ theta**2 + qp.soft_linear @ theta + qp.move_weight)
+
+
+def _dual_infeasibility(qp: CondensedQp, w_matrix, instance: QpInstance, prices: _Prices, lower, upper):
+    """Largest force of a price that no solution can have."""
+
+    def wrong(price, limit, reach):
+        """Negative prices, and any price where there is no limit."""
+        return jnp.where(jnp.isfinite(limit), jnp.maximum(-price, 0.0), jnp.abs(price)) * reach
+
+    reach = jnp.max(jnp.abs(qp.theta), axis=1)
+    hard = jnp.max(jnp.abs(w_matrix), axis=1, initial=0.0)
+    excess = jnp.maximum(jnp.abs(prices.row) - qp.soft_linear, 0.0)
+    found = [
+        wrong(prices.lower, lower, 1.0),
+        wrong(prices.upper, upper, 1.0),
+        wrong(prices.row_low, instance.row_low, hard),
+        wrong(prices.row_high, instance.row_high, hard),
+        jnp.where(qp.soft_quadratic > 0.0, 0.0, excess) * reach,
+    ]
+    reach = reach[: instance.limit_high.shape[0]]
+    for price, limit in ((prices.high, instance.limit_high), (prices.low, instance.limit_low)):
+        beyond = jnp.maximum(_per_group(qp, price, jnp.sum) - qp.slack_weight, 0.0)
+        found += [wrong(price, limit, reach), beyond * _per_group(qp, reach, jnp.max)]
+    return _largest(*found)

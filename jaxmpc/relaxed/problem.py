@@ -1,0 +1,338 @@
+"""The relaxed problem itself: its value, its scale, its Newton matrix, its solution type and its dual bound.
+
+`qp` and `newton` are two methods for it; `relaxation` combines them. Both work on a `Prepared` lane, in which the
+objective is divided by a unit that brings curvatures and prices to the order of one.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxmpc.problem.condense import CondensedQp, QpInstance
+from jaxmpc.relaxed.gram import gram
+from jaxmpc.status import FAILED, OPTIMAL
+
+FIXED = 1e-9  # box width [scaled moves] below which a variable is a constant
+TINY = 1e-300
+FEASIBLE = 1e-8  # hard rows and limits, in scaled moves
+ACCEPTED = 1e-6  # relative duality gap up to which a solution counts as solved
+RIDGE = 1e-13  # on the diagonal of a Newton matrix, whose entries are of the order of one
+LEAST_SHARE = 1e-7  # of the solver unit: objectives below it have their gap measured against it
+
+
+class QpSolution(eqx.Module):
+    """Result of one relaxed problem; all fields in the scaled units of `CondensedQp`.
+
+    Attributes:
+        x: moves.
+        objective: value of the relaxed problem at x, constants included.
+        bound: lower bound of the relaxed problem from the multipliers, constants included; valid for any status.
+        status: `status.OPTIMAL` or `status.FAILED`.
+        iterations: Newton steps and interior-point iterations.
+        row_price: multiplier of every row's deadzone cost (subgradient in t).
+        limit_price: net price of the CV limits per prediction row (high minus low).
+        lower_price, upper_price: multipliers of the limits of x, non-negative.
+        row_low_price, row_high_price: multipliers of the hard rows, non-negative.
+        residual: relative duality gap or violation of the hard rows, whichever is larger (`kkt` has more).
+    """
+
+    x: Float[Array, " n"]
+    objective: Float[Array, ""]
+    bound: Float[Array, ""]
+    status: Int[Array, ""]
+    iterations: Int[Array, ""]
+    row_price: Float[Array, " row"]
+    limit_price: Float[Array, " prediction"]
+    lower_price: Float[Array, " n"]
+    upper_price: Float[Array, " n"]
+    row_low_price: Float[Array, " hard"]
+    row_high_price: Float[Array, " hard"]
+    residual: Float[Array, ""]
+
+
+class Slopes(NamedTuple):
+    """Weights of a proximal Newton step.
+
+    Attributes:
+        level, sharp: of the predictions, see `gram`.
+        envelope: of the rows of the envelope.
+        box: of the limits of x.
+        hard: of the hard rows.
+    """
+
+    level: Float[Array, " prediction"]
+    sharp: Float[Array, " prediction"]
+    envelope: Float[Array, " envelope"]
+    box: Float[Array, " n"]
+    hard: Float[Array, " hard"]
+
+
+class Prepared(eqx.Module):
+    """One lane, ready to be solved; objective terms are divided by `unit`.
+
+    Attributes:
+        qp, w_matrix, instance, lower, upper: the problem as it was given; `w_matrix` holds the hard rows.
+        unit: what objectives and prices are divided by.
+        hessian, linear: smooth part of the objective.
+        curvature, steepness: 2 S and s per row.
+        soft: rows that have a deadzone cost.
+        free: moves with room between their limits.
+        takes_part: hard rows with free moves; the others are constants.
+        row_low, row_high: their limits, infinite for the constants.
+        limit_low, limit_high: CV limits that cost something, infinite for the others; empty where there are none at all.
+    """
+
+    qp: CondensedQp
+    w_matrix: Float[Array, "hard n"]
+    instance: QpInstance
+    lower: Float[Array, " n"]
+    upper: Float[Array, " n"]
+    unit: Float[Array, ""]
+    hessian: Float[Array, "n n"]
+    linear: Float[Array, " n"]
+    curvature: Float[Array, " row"]
+    steepness: Float[Array, " row"]
+    soft: Bool[Array, " row"]
+    free: Bool[Array, " n"]
+    takes_part: Bool[Array, " hard"]
+    row_low: Float[Array, " hard"]
+    row_high: Float[Array, " hard"]
+    limit_low: Float[Array, " limit"]
+    limit_high: Float[Array, " limit"]
+
+    @property
+    def predictions(self) -> int:
+        """Rows of predictions; those of the envelope follow."""
+        return self.instance.limit_high.shape[0]
+
+    @property
+    def keep(self) -> Float[Array, " n"]:
+        """1 for free moves, 0 for fixed ones."""
+        return self.free.astype(self.lower.dtype)
+
+    def respond(self, x: Float[Array, " n"]) -> Float[Array, " row"]:
+        """Theta x."""
+        return self.qp.response @ (self.qp.scale * x)
+
+    def pull(self, prices: Float[Array, " row"]) -> Float[Array, " n"]:
+        """Theta' prices; the rows may be the predictions alone."""
+        return (prices @ self.qp.response[: prices.shape[0]]) * self.qp.scale
+
+    def newton_matrix(self, row, hard, box, ridge) -> Float[Array, "n n"]:
+        """Hessian + theta' diag(row) theta + W' diag(hard) W + diag(box) + ridge; identity on fixed moves."""
+        response = self.qp.response
+        return self._assembled(response.T @ (row[:, None] * response), hard, box, ridge)
+
+    def net(self, row: Float[Array, " row"], limit: Float[Array, " limit"]) -> Float[Array, " row"]:
+        """Prices of the rows with those of the CV limits, which come first among them, added."""
+        return jnp.concatenate([row[: limit.shape[0]] + limit, row[limit.shape[0] :]]) if len(limit) else row
+
+    def proximal_matrix(self, slopes: Slopes, ridge) -> Float[Array, "n n"]:
+        """`newton_matrix` for the weights of a proximal Newton step."""
+        qp, predictions = self.qp, self.predictions
+        cvs = qp.slack_weight.shape[0]
+        squares = gram(qp.response[:predictions], qp.summed, cvs, slopes.level, slopes.sharp)
+        own = slopes.envelope @ qp.response[predictions:] ** 2  # one move each
+        return self._assembled(squares + jnp.diag(own), slopes.hard, slopes.box, ridge)
+
+    def _assembled(self, squares, hard, box, ridge):
+        """The Newton matrix, given the squares of the rows in MV units."""
+        keep, scale, w_matrix = self.keep, self.qp.scale, self.w_matrix
+        matrix = self.hessian + scale[:, None] * scale[None, :] * squares
+        matrix += w_matrix.T @ (hard[:, None] * w_matrix)
+        return matrix * keep[:, None] * keep[None, :] + jnp.diag(keep * box + (1.0 - keep + ridge))
+
+    def value(self, x, t) -> Float[Array, ""]:
+        """Objective in its own unit at x with t = theta x + t0."""
+        return _value(self.qp, self.instance, x, t)
+
+
+def prepare(
+    qp: CondensedQp,
+    rows: Float[Array, "hard n"] | np.ndarray,
+    instance: QpInstance,
+    lower: Float[Array, " n"],
+    upper: Float[Array, " n"],
+) -> Prepared:
+    """Scale one lane (use `jax.vmap` for a batch).
+
+    Args:
+        qp: constant part.
+        rows: hard rows, `blocking.hard_rows(structure)`.
+        instance: offsets and limits of this sample.
+        lower, upper: limits of x; equal limits fix a move.
+    """
+    w_matrix = jnp.asarray(rows)
+    offset, size = instance.offset, jnp.abs(qp.response)
+    linear = 2.0 * ((qp.quadratic * offset) @ qp.response) * qp.scale
+    beyond = jnp.maximum(jnp.abs(offset) - qp.deadzone, 0.0)
+    steep = jnp.abs(linear) + ((qp.soft_linear + 2.0 * qp.soft_quadratic * beyond) @ size) * qp.scale
+    unit = jnp.maximum(jnp.max(jnp.diagonal(qp.curvature) + qp.bend), 1e-2 * jnp.max(steep))
+    if qp.has_limits:
+        unit = jnp.maximum(unit, 1e-3 * jnp.max(qp.slack_weight * qp.reach))
+    unit = jnp.where(unit > 0.0, unit, 1.0)
+    free = (upper - lower) > FIXED
+    # rows without free moves are constants and leave the solver; feasibility of the whole is checked outside
+    takes_part = (jnp.abs(w_matrix) @ free.astype(lower.dtype)) > 0.0
+    paid = jnp.repeat(qp.slack_weight > 0.0, instance.limit_high.shape[0] // qp.slack_weight.shape[0])
+    return Prepared(
+        qp=qp,
+        w_matrix=w_matrix,
+        instance=instance,
+        lower=lower,
+        upper=upper,
+        unit=unit,
+        hessian=qp.hessian / unit,
+        linear=linear / unit,
+        curvature=2.0 * qp.soft_quadratic / unit,
+        steepness=qp.soft_linear / unit,
+        soft=(qp.soft_quadratic + qp.soft_linear) > 0.0,
+        free=free,
+        takes_part=takes_part,
+        row_low=jnp.where(takes_part, instance.row_low, -jnp.inf),
+        row_high=jnp.where(takes_part, instance.row_high, jnp.inf),
+        limit_low=jnp.where(paid, instance.limit_low, -jnp.inf) if qp.has_limits else jnp.zeros(0),
+        limit_high=jnp.where(paid, instance.limit_high, jnp.inf) if qp.has_limits else jnp.zeros(0),
+    )
+
+
+def solve_positive(matrix: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Solution of a symmetric positive definite system; not a number where it is not definite."""
+    return substitute(factorise(matrix), rhs)
+
+
+def factorise(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Cholesky factor of a symmetric matrix (transposed, which is how LAPACK stores it: this saves a copy)."""
+    return jax.lax.linalg.cholesky(matrix.T, symmetrize_input=False)
+
+
+def substitute(factor: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Solution of the factorised system."""
+    half = jax.lax.linalg.triangular_solve(factor, rhs[:, None], left_side=True, lower=True)
+    return jax.lax.linalg.triangular_solve(factor, half, left_side=True, lower=True, transpose_a=True)[:, 0]
+
+
+def evaluate(qp: CondensedQp, instance: QpInstance, x: Float[Array, " n"]) -> Float[Array, ""]:
+    """Objective of the relaxed problem at x, constants included; equals (6.6) where integer moves are whole."""
+    return _value(qp, instance, x, qp.response @ (qp.scale * x) + instance.offset)
+
+
+def _value(qp: CondensedQp, instance: QpInstance, x, t) -> Float[Array, ""]:
+    rows = total(qp.quadratic * t**2 + _soft_cost(qp, t))
+    return rows + jnp.sum(qp.move_weight * x**2) + jnp.sum(limit_cost(qp, instance, t))
+
+
+def total(values: Float[Array, " row"]) -> Float[Array, ""]:
+    """Sum over rows; as a matrix product it takes XLA half the time of a reduction on a CPU."""
+    return values @ np.ones(values.shape[0])
+
+
+def _soft_cost(qp: CondensedQp, t):
+    beyond = jnp.maximum(jnp.abs(t) - qp.deadzone, 0.0)
+    return (qp.soft_quadratic * beyond + qp.soft_linear) * beyond
+
+
+def limit_cost(qp: CondensedQp, instance: QpInstance, t):
+    """Rho times the largest violation per CV and side, high sides first."""
+    if not qp.has_limits:
+        return jnp.zeros(1)
+    cvs = qp.slack_weight.shape[0]
+    y = t[: instance.limit_high.shape[0]]
+    over = jnp.max((y - instance.limit_high).reshape(cvs, -1), axis=1)
+    under = jnp.max((instance.limit_low - y).reshape(cvs, -1), axis=1)
+    rho = jnp.concatenate([qp.slack_weight, qp.slack_weight])
+    return rho * jnp.maximum(jnp.concatenate([over, under]), 0.0)
+
+
+class Prices(eqx.Module):
+    """Multipliers in the objective's own unit, net of both sides; `limit` may be empty or None where all are zero."""
+
+    row: Float[Array, " row"]
+    hard: Float[Array, " hard"]
+    limit: Float[Array, " limit"] | None = None
+
+
+def conclude(
+    problem: Prepared, x: Float[Array, " n"], prices: Prices, iterations: Int[Array, ""]
+) -> QpSolution:
+    """Bound, value and verdict of moves and prices, wherever they come from.
+
+    The bound is Lagrangian, with prices made dual feasible: soft(t) >= v t - soft*(v) with
+    soft*(v) = c|v| + max(|v| - s, 0)^2 / (4 S), and rho max(0, w) >= sum of p w for p >= 0 with sum p <= rho. What is left
+    of the gradient in x is covered by the box of x.
+
+    Args:
+        problem: the lane.
+        x: moves within their limits.
+        prices: of any quality.
+        iterations: to be reported.
+
+    Returns:
+        `QpSolution` with status `OPTIMAL` if its duality gap is at most `ACCEPTED` and the hard rows hold to `FEASIBLE`.
+    """
+    qp, instance = problem.qp, problem.instance
+    s2, s1 = qp.soft_quadratic, qp.soft_linear
+    t = problem.respond(x) + instance.offset
+    price = jnp.where(s2 > 0, prices.row, jnp.clip(prices.row, -s1, s1))
+    over = jnp.maximum(jnp.abs(price) - s1, 0.0)
+    conjugate = qp.deadzone * jnp.abs(price) + over**2 / jnp.where(s2 > 0, 4.0 * s2, 1.0)
+    # the gap is summed term by term: each is small at a solution, while objective and bound may be large
+    found = total(_soft_cost(qp, t) + conjugate - price * t)
+    net, limit_price = price, jnp.zeros_like(instance.limit_high)
+    if qp.has_limits:
+        found += jnp.sum(limit_cost(qp, instance, t))
+    if qp.has_limits and prices.limit is not None:
+        limit_price, paid = _limit_terms(qp, instance, t, prices.limit)
+        found -= paid
+        net = problem.net(price, limit_price)
+    wx = x @ problem.w_matrix.T
+    row_low, row_high = jnp.maximum(-prices.hard, 0.0), jnp.maximum(prices.hard, 0.0)
+    found -= jnp.sum(jnp.where(row_high > 0, row_high * (wx - instance.row_high), 0.0))
+    found -= jnp.sum(jnp.where(row_low > 0, row_low * (instance.row_low - wx), 0.0))
+    gradient = (
+        qp.hessian @ x + problem.linear * problem.unit + problem.pull(net) + prices.hard @ problem.w_matrix
+    )
+    # the box of x is not priced but kept: min over the box of gradient'(z - x), curvature left out
+    lower, upper = problem.lower, problem.upper
+    reach_low = jnp.where(jnp.isfinite(lower), lower, x - 10.0 * (1.0 + jnp.abs(x)))
+    reach_high = jnp.where(jnp.isfinite(upper), upper, x + 10.0 * (1.0 + jnp.abs(x)))
+    found -= jnp.sum(jnp.minimum(gradient * (reach_low - x), gradient * (reach_high - x)))
+    objective = problem.value(x, t)
+    relative = found / jnp.maximum(jnp.abs(objective), LEAST_SHARE * problem.unit)
+    outside = jnp.maximum(wx - instance.row_high, instance.row_low - wx)
+    broken = jnp.max(jnp.where(problem.takes_part, outside, -jnp.inf), initial=0.0)
+    good = (relative <= ACCEPTED) & (broken <= FEASIBLE) & ~jnp.any(lower > upper + FIXED)
+    return QpSolution(
+        x=x,
+        objective=objective,
+        bound=objective - found,
+        status=jnp.where(good, OPTIMAL, FAILED),
+        iterations=iterations,
+        row_price=price,
+        limit_price=limit_price,
+        lower_price=jnp.maximum(gradient, 0.0),
+        upper_price=jnp.maximum(-gradient, 0.0),
+        row_low_price=row_low,
+        row_high_price=row_high,
+        residual=jnp.maximum(relative, broken),
+    )
+
+
+def _limit_terms(qp: CondensedQp, instance: QpInstance, t, price):
+    """Prices of the CV limits that spend no more than rho per CV and side, and what they add to the bound."""
+    cvs, predictions = qp.slack_weight.shape[0], instance.limit_high.shape[0]
+    rho = jnp.concatenate([qp.slack_weight, qp.slack_weight])
+    both = jnp.maximum(jnp.concatenate([price, -price]), 0.0).reshape(2 * cvs, -1)
+    spent = jnp.sum(both, axis=1)
+    both = both * jnp.where(spent > rho, rho / jnp.maximum(spent, TINY), 1.0)[:, None]
+    high, low = both.reshape(-1)[:predictions], both.reshape(-1)[predictions:]
+    y = t[:predictions]
+    paid = total(jnp.where(high > 0, high * (y - instance.limit_high), 0.0))
+    paid += total(jnp.where(low > 0, low * (instance.limit_low - y), 0.0))
+    return high - low, paid

@@ -1,0 +1,1 @@
+"""Steady states: the map and the real-time optimiser (6.19)."""
