@@ -18,7 +18,7 @@ class FigureEntry:
     Attributes:
         id: ``10`` for thesis figure 10, or a name.
         title: what it shows.
-        study: name in `studies.catalogue.STUDIES` of the study whose results it reads; None if it reads none.
+        study: name in `studies.thesis.catalogue.STUDIES` of the study whose results it reads; None if it reads none.
         name: of its files.
         function: makes it, as a context that closes the figure: called with the results and `arguments`.
         needs: controllers whose runs must be finished.

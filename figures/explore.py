@@ -1,6 +1,6 @@
 """Figures of the interactive app: one run beside a pinned one, the plan made at any time, the scenarios of a store.
 
-Runs come as results of one controller (`studies.explore.ExploreRun.data`, or `stored` for a scenario of a store). The
+Runs come as results of one controller (`studies.notebooks.loop.ExploreRun.data`, or `stored` for a scenario of a store). The
 layout is fixed instead of computed, so that a figure is there a fraction of a second after its run.
 """
 
@@ -22,14 +22,14 @@ from matplotlib.figure import Figure
 
 from figures import panels, style
 from figures.facts import index_of
-from figures.sweep_data import controller_of, deviation, figure_of, load, setting, sweep_axes
-from figures.wear import front
+from figures.sweep.data import controller_of, deviation, figure_of, load, setting, sweep_axes
+from figures.sweep.wear import front
 from jaxmpc.errors import InputError
-from studies.evaluate import completed, key_figures
-from studies.explore import RUN
-from studies.plans import StoredPlan, plan_at
-from studies.presets import CHOKE, TUNINGS
-from studies.store import RESULTS, open_results
+from studies.definition.presets import CHOKE, TUNINGS
+from studies.kpi.evaluate import completed, key_figures
+from studies.notebooks.loop import RUN
+from studies.store.comparison import RESULTS, open_results
+from studies.thesis.plans import StoredPlan, plan_at
 
 BEFORE = 600.0  # s of the past beside a plan
 MINUTE = 60.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from studies import kpi
-from studies.presets import CHOKE, GAS, OIL
+from studies.definition.presets import CHOKE, GAS, OIL
+from studies.kpi import loop as kpi
 
 LATE = 600.0  # s at the end of a stretch that stand for what it settles at
 

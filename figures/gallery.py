@@ -17,8 +17,8 @@ from figures.produce import study_folder
 from figures.registry import FIGURES, check_ids
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
-from studies.definition import PLANTS, PlantKind
-from studies.store import open_results
+from studies.definition.comparison import PLANTS, PlantKind
+from studies.store.comparison import open_results
 
 PAGE = "index.html"
 LARGEST = 10_000_000  # bytes; a page that opens at once and can be mailed

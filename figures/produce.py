@@ -7,10 +7,10 @@ from pathlib import Path
 
 from figures.registry import FIGURES, check_ids, draw
 from jaxmpc.errors import InputError
-from studies import catalogue
-from studies.comparison import is_current as stored_as
-from studies.definition import PLANTS, PlantKind
-from studies.store import check_writable
+from studies.definition.comparison import PLANTS, PlantKind
+from studies.run.comparison import is_current as stored_as
+from studies.store.comparison import check_writable
+from studies.thesis import catalogue
 
 
 def produce(
@@ -67,7 +67,7 @@ def is_current(study: str, results: str | Path, quick: bool, plant: PlantKind) -
     """Whether every run of a study is stored, made from today's definition by today's code.
 
     Args:
-        study: a key of `studies.catalogue.STUDIES`.
+        study: a key of `studies.thesis.catalogue.STUDIES`.
         results: folder of all results.
         quick: whether the shortened study is meant.
         plant: of the study.

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import xarray as xr
 
-from figures import extensions, scenario_entries, style, thesis_entries, unblocked
+from figures import style
 from figures.entry import FigureEntry
+from figures.thesis import extensions, scenario_entries, thesis_entries, unblocked
 from jaxmpc.errors import InputError
-from studies.evaluate import completed
-from studies.store import open_results
+from studies.kpi.evaluate import completed
+from studies.store.comparison import open_results
 
 
 def _order(entry: FigureEntry) -> tuple[bool, int]:

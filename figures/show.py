@@ -17,15 +17,16 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from figures import panels, style, wear
+from figures import panels, style
 from figures.explore import is_comparison
-from figures.sweep import run_results
-from figures.sweep_data import load
+from figures.sweep import wear
+from figures.sweep.data import load
+from figures.sweep.draw import run_results
 from jaxmpc.errors import InputError
 from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.problem.tuning import Tuning
-from studies.evaluate import completed
-from studies.store import open_results
+from studies.kpi.evaluate import completed
+from studies.store.comparison import open_results
 
 
 class Panels(np.ndarray):
@@ -82,7 +83,7 @@ def pareto(study: str | Path | xr.Dataset, x: str = "choke_travel", **options: A
     Args:
         study: path of the store, or what `open_study` gave.
         x: key figure along the horizontal axis.
-        **options: of `figures.wear.pareto`.
+        **options: of `figures.sweep.wear.pareto`.
 
     Raises:
         InputError: if there is no store, or for a key figure that is not there.

@@ -247,7 +247,7 @@ def trajectory(run: Any) -> str:
 
 
 def study(expanded: Any) -> str:
-    """A `studies.sweep.scenarios.Study`: what varies, and what a run would take."""
+    """A `studies.definition.scenarios.Study`: what varies, and what a run would take."""
     about = expanded.describe()
     known = {
         "scenarios": about.scenarios,

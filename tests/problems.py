@@ -2,7 +2,7 @@
 
 Every function returns the content of a case file (a dictionary) and draws from the generator it is given, so
 a seed names a case. `TWISTS` are the awkward situations: each changes a case in place. The oracles in
-`tests.oracles` are the judges; nothing here calls the library.
+`tests.oracles.steps` are the judges; nothing here calls the library.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests import oracles
+from tests.oracles import steps as oracles
 
 PUBLISHED = Path(__file__).resolve().parents[2] / "shared" / "data" / "single_well_step_response.json"
 THESIS_BLOCKS = [1, 1, 1, 1, 2, 2, 4, 4, 8, 8, 8, 16, 16, 32, 32, 64]

@@ -5,9 +5,9 @@ import xarray as xr
 
 from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.model.step_response import make_model
-from studies.comparison import comparison_template
-from studies.definition import ComparisonDefinition, ReferenceDefinition
-from studies.thesis import CONTROLLERS
+from studies.definition.comparison import ComparisonDefinition, ReferenceDefinition
+from studies.run.comparison import comparison_template
+from studies.thesis.comparison import CONTROLLERS
 
 DT = 10.0
 REFERENCE = ReferenceDefinition((0.0, 2000.0), ((10_000.0, 150.0), (30_000.0, 300.0)), 4000.0)

@@ -154,7 +154,7 @@ HAZARDS = {
 
 def preparation(hazard: str, index: int, folder):
     """A `prepare_study` whose study has the hazard."""
-    from studies.sweep.chunk import prepare_study
+    from studies.run.chunk import prepare_study
 
     def prepare(study):
         chunks = Hazards(study.chunks, hazard, index, folder)
@@ -165,12 +165,12 @@ def preparation(hazard: str, index: int, folder):
 
 def main() -> None:
     """Run the command line with a hazard; figures are left out."""
-    import figures.sweep
+    import figures.sweep.draw
     from jaxmpc.cli import main as cli
-    from studies.sweep import runner
+    from studies.run import runner
 
     program, hazard, index, folder, *arguments = sys.argv
     sys.argv = [program, *arguments]
     runner.prepare_study = preparation(hazard, int(index), folder)
-    figures.sweep.draw_sweep = lambda store, folder: []
+    figures.sweep.draw.draw_sweep = lambda store, folder: []
     sys.exit(cli.main())

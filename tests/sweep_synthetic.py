@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from studies.sweep.layout import Column, StoreLayout, Variable, digest
-from studies.sweep.store import SweepStore
+from studies.store.layout import Column, StoreLayout, Variable, digest
+from studies.store.sweep import SweepStore
 
 DEADZONE = ("tuning.deadzone.gas_rate", "deadzone of the gas rate", "m3/h")
 OIL_DEADZONE = ("tuning.deadzone.oil_rate", "deadzone of the oil rate", "m3/h")

@@ -24,8 +24,8 @@ DOORS = {
     "distributed": ("studies/",),
     "xarray": ("studies/", "figures/"),
     "zarr": ("studies/",),
-    "optuna": ("studies/sweep/search.py",),
-    "scipy": ("studies/bench/", "studies/sweep/axes.py"),
+    "optuna": ("studies/search/run.py",),
+    "scipy": ("studies/bench/", "studies/definition/axes.py"),
     **dict.fromkeys(
         ("piqp", "clarabel", "osqp", "daqp", "qpax", "pyscipopt", "gurobipy"), ("studies/bench/peers.py",)
     ),

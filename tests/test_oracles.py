@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests import oracles, problems
+from tests import problems
+from tests.oracles import steps as oracles
 
 SHAPES = (
     dict(hp=10, blocks=[1, 1, 2, 2]),

@@ -206,20 +206,20 @@ def _study_comparison(options: argparse.Namespace, plant) -> int:
     check_folder("--out", options.out)
     asked = options.out, options.quick, plant
     if options.study == "claims":
-        from studies.claims_study import run_claims
+        from studies.thesis.claims_study import run_claims
 
         print(f"Claims: {run_claims(*asked) / 'claims.html'}")
         return EXIT_OPTIMAL
     if options.study == "rto":
-        from figures.rto import draw_all as draw_rto
-        from studies.rto import run_rto
+        from figures.thesis.rto import draw_all as draw_rto
+        from studies.thesis.rto import run_rto
 
         folder = run_rto(*asked)
         draw_rto(folder)
     else:
-        from figures.comparison import draw_all
-        from studies.catalogue import run_named
-        from studies.report import write_summary
+        from figures.thesis.comparison import draw_all
+        from studies.thesis.catalogue import run_named
+        from studies.thesis.report import write_summary
 
         folder = run_named(options.study, *asked)
         draw_all(folder, options.study)
@@ -229,7 +229,7 @@ def _study_comparison(options: argparse.Namespace, plant) -> int:
 
 
 def _study_sweep(options: argparse.Namespace, given: dict[str, Any]) -> int:
-    from studies.sweep.scenarios import load_study
+    from studies.definition.scenarios import load_study
 
     dry = "dry_run" in given
     try:
@@ -238,22 +238,22 @@ def _study_sweep(options: argparse.Namespace, given: dict[str, Any]) -> int:
         raise _refused(error, options.study) from None
     if dry:
         return _dry_run(study, options, given)
-    from studies.sweep.runner import RunError, run_study
-    from studies.sweep.search_study import SearchStudy
+    from studies.run.runner import RunError, run_study
+    from studies.search.study import SearchStudy
 
     store = given.get("store", options.out / f"{study.name}.zarr")
     spread = {"workers": given.get("workers", 1), "dask": given.get("dask")}
     try:
         command = _command(options.study, options.quick, "yes" in given)
         if isinstance(study, SearchStudy):
-            from studies.sweep.search import run_search
+            from studies.search.run import run_search
 
             path = run_search(study, store, **spread, command=command)
         else:
             path = run_study(study, store, **spread, command=command)
     except RunError as error:
         return _complain(error, EXIT_OTHER)
-    from figures.sweep import draw_sweep
+    from figures.sweep.draw import draw_sweep
 
     folder = path.with_name(f"{path.stem}-figures")
     draw_sweep(path, folder)
@@ -266,8 +266,8 @@ def _study_sweep(options: argparse.Namespace, given: dict[str, Any]) -> int:
 
 def _refused(error: InputError, study: str) -> InputError:
     """The error of a definition with what the command line can do about it."""
-    from studies.sweep.definition import shipped_studies
-    from studies.sweep.fields import near
+    from studies.definition.fields import near
+    from studies.definition.sweep import shipped_studies
 
     if error.field == "study.confirmation_limit":
         hint = "Give --yes to run them all, --dry-run to see how long that takes"
@@ -280,7 +280,7 @@ def _refused(error: InputError, study: str) -> InputError:
 
 
 def _dry_run(study: Any, options: argparse.Namespace, given: dict[str, Any]) -> int:
-    from studies.sweep.status import status_of
+    from studies.run.status import status_of
 
     print(study.describe())
     found = status_of(given.get("store", options.out / f"{study.name}.zarr"), study.hash)
@@ -294,21 +294,21 @@ def _dry_run(study: Any, options: argparse.Namespace, given: dict[str, Any]) -> 
 
 def _command(study: str, quick: bool, confirmed: bool) -> str:
     """What follows ``jaxmpc study run`` to go on with a study, from any folder."""
-    from studies.sweep.definition import shipped_studies
+    from studies.definition.sweep import shipped_studies
 
     name = study if study in shipped_studies() else str(Path(study).resolve())
     return shlex.quote(name) + quick * " --quick" + confirmed * " --yes"
 
 
 def _study_status(options: argparse.Namespace) -> int:
-    from studies.sweep.status import status
+    from studies.run.status import status
 
     print(status(options.store, options.verify))
     return EXIT_OPTIMAL
 
 
 def _study_export(options: argparse.Namespace) -> int:
-    from studies.sweep.export import export
+    from studies.store.export import export
 
     suffix = {None: "csv", "netcdf": "nc"}.get(options.kind, options.kind)
     target = options.target or Path(f"{options.store.stem}.{suffix}")
@@ -325,7 +325,7 @@ def _simulate(options: argparse.Namespace) -> int:
     check_folder("--out", options.out)
     import warnings
 
-    from studies.sweep.rerun import rerun
+    from studies.run.rerun import rerun
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
@@ -334,7 +334,7 @@ def _simulate(options: argparse.Namespace) -> int:
         print(f"jaxmpc: {warning.message}", file=sys.stderr)
     folder = options.out / f"{Path(store).stem}-{int(number)}"
     print(again.save(folder))
-    from figures.sweep import draw_run
+    from figures.sweep.draw import draw_run
 
     look = {"kind": again.kind, "actuator": again.actuator}
     for path in draw_run(again.trajectory, again.deadzone, folder, again.title, **look):

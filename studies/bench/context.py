@@ -15,11 +15,11 @@ import numpy as np
 from identify.step_test import identify_step_response
 from jaxmpc.loop.reference import Reference
 from jaxmpc.model.step_response import StepResponseModel
-from studies import references
 from studies.bench.instances import MODES, Mode, Recordings
 from studies.bench.judge import LONG, REPEATS
 from studies.bench.peers import Peer, PeerAnswer, Solve
 from studies.bench.rows import Row
+from studies.definition import references
 
 
 @dataclasses.dataclass(frozen=True)

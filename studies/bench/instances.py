@@ -32,8 +32,8 @@ from jaxmpc.problem.tuning import Tuning
 from jaxmpc.process.plant import WellPlant
 from jaxmpc.process.well.equations import well_hash
 from jaxmpc.programs.cache import cache_folder, read_sealed, sealed
-from studies import presets
-from studies.fingerprint import content_hash
+from studies.definition import presets
+from studies.store.fingerprint import content_hash
 
 Kind = Literal["continuous", "mixed-integer"]
 Mode = Literal["moves", "inputs"]

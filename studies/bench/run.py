@@ -16,7 +16,7 @@ from studies.bench.context import FULL, QUICK, Context, Size
 from studies.bench.peers import MIQP_PEERS, QP_PEERS, Peer
 from studies.bench.rows import Report, Row, table
 from studies.bench.sections import exact, growth, loops, relaxed, startup, sweeps
-from studies.fingerprint import versions
+from studies.store.fingerprint import versions
 
 Section = Callable[[Context], Iterator[Row]]
 SECTIONS: dict[str, Section] = {

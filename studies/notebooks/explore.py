@@ -1,7 +1,7 @@
 """The interactive app: a closed loop whose controls answer at once, and a page that opens study stores.
 
 ``jaxmpc explore`` serves it. As a script, ``python -m studies.notebooks.explore``, it runs once and prints key figures.
-Computing is in `studies.explore`, drawing in `figures.explore`; here are only controls and where things go.
+Computing is in `studies.notebooks.loop`, drawing in `figures.explore`; here are only controls and where things go.
 """
 
 import marimo
@@ -22,7 +22,8 @@ def _(mo):
     from figures import explore as draw
     from jaxmpc import html
     from jaxmpc.errors import InputError
-    from studies import explore, presets
+    from studies.definition import presets
+    from studies.notebooks import loop as explore
 
     # Ratios to the preset's own value, so that one slider serves values of any size.
     RATIOS = [2.0**k for k in range(-5, 6)]
@@ -295,9 +296,9 @@ def _(InputError, again, draw, mo, page, path, picked):
             if again.value:
                 from pathlib import Path
 
-                from figures.sweep import run_results
-                from studies.explore import RUN
-                from studies.sweep.rerun import rerun
+                from figures.sweep.draw import run_results
+                from studies.notebooks.loop import RUN
+                from studies.run.rerun import rerun
 
                 with mo.status.spinner("running"):
                     found = rerun(Path(store), number)
@@ -316,6 +317,6 @@ def _(InputError, again, draw, mo, page, path, picked):
 
 
 if __name__ == "__main__":
-    from studies.explore import main
+    from studies.notebooks.loop import main
 
     main()

@@ -13,10 +13,10 @@ from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import simulate_batch
 from jaxmpc.problem.tuning import Tuning
 from jaxmpc.process.plant import WellPlant
-from studies import presets, references
 from studies.bench.context import Context
 from studies.bench.instances import Kind, Mode, Recording, make_controller
 from studies.bench.rows import Goal, Row, timed
+from studies.definition import presets, references
 
 RUN_SECONDS, RUN_AIM, RUN_SAMPLES = 20.0, 6.0, 7800  # floor and aim of the thesis run
 

@@ -15,12 +15,12 @@ import numpy as np
 from jaxmpc.errors import InputError
 from studies.bench.context import Context
 from studies.bench.rows import Goal, Row
-from studies.sweep.chunk import stored_variables
-from studies.sweep.definition import StudyDefinition
-from studies.sweep.layout import Column, StoreLayout
-from studies.sweep.reading import chunk_facts, kpi_frame
-from studies.sweep.runner import run_study
-from studies.sweep.store import SweepStore
+from studies.definition.sweep import StudyDefinition
+from studies.run.chunk import stored_variables
+from studies.run.runner import run_study
+from studies.store.layout import Column, StoreLayout
+from studies.store.reading import chunk_facts, kpi_frame
+from studies.store.sweep import SweepStore
 
 CHUNK = 64
 SHARE = 0.05  # of the time of the closed loops that everything else may take

@@ -1,0 +1,284 @@
+"""What the figures of a sweep study need to know of its store: what varies, which runs are there, which is the thesis's.
+
+A study is recognised by its columns and not by its name, so that any study with such columns gets the same figures.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from figures import style
+from jaxmpc.errors import InputError
+from studies.definition.fields import FIELDS, as_text
+from studies.definition.presets import TUNINGS
+from studies.store.comparison import provenance
+from studies.store.layout import FLAG
+from studies.store.reading import open_study
+
+CONTROLLER = ("controller", "actuator")
+STRUCTURE = ("blocking", "blocks", "prediction_horizon", "control_horizon")
+TUNING = (*STRUCTURE, "preset", "soft", "first_penalised", "mean_move_window", "mean_move_mode")
+UNCERTAIN = ("plant.", "plant_scale.", "noise.", "disturbance.", "seed")
+DECIDING = ("tuning.deadzone.gas_rate", "tuning.deadzone.oil_rate", "tuning.move_weight.choke")
+THESIS_DEADZONE = TUNINGS["thesis"]["deadzone"]  # by CV [m3/h]
+EVEN = 1.5  # largest over smallest distance of values that count as evenly spaced
+UNEVEN = 4.0  # beyond it on both scales, values are drawn at equal distances
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SweepAxis:
+    """Something that varies between the scenarios.
+
+    Attributes:
+        key: of the column; of the first one for columns that move together.
+        label: in words.
+        unit: "1" without unit, "" for text.
+        values: one per scenario, numbers or text.
+        linked: keys of the columns that move with it, one to one.
+    """
+
+    key: str
+    label: str
+    unit: str
+    values: np.ndarray
+    linked: tuple[str, ...] = ()
+
+    @property
+    def numeric(self) -> bool:
+        """Whether its values are numbers."""
+        return self.values.dtype.kind in "biuf"
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether it is what a controller does not choose: well, noise, disturbance."""
+        return self.key.startswith(UNCERTAIN)
+
+    @property
+    def unique(self) -> list:
+        """Its distinct values: numbers increasing, texts in the order of the scenarios."""
+        return list(np.unique(self.values)) if self.numeric else list(dict.fromkeys(self.values.tolist()))
+
+    @property
+    def title(self) -> str:
+        """For an axis or a colour bar."""
+        return f"{self.label} [{unit(self.unit)}]" if self.numeric else self.label
+
+    def text(self, value) -> str:
+        """One of its values in words, with the unit."""
+        if not self.numeric:
+            return str(value)
+        return f"{value:g}" + (f" {unit(self.unit)}" if self.unit != "1" else "")
+
+    @property
+    def scale(self) -> str:
+        """``linear`` or ``log`` if the values are spaced like that, else ``equal`` distances."""
+        spread = {"linear": spacing(np.array(self.unique))}
+        if min(self.unique) > 0:
+            spread["log"] = spacing(np.log(self.unique))
+        best = min(spread, key=lambda name: (spread[name] > EVEN, spread[name]))
+        return best if spread[best] <= UNEVEN else "equal"
+
+
+def spacing(values: np.ndarray) -> float:
+    """Largest over smallest distance of increasing values."""
+    steps = np.diff(values)
+    return float(steps.max() / steps.min()) if len(steps) else 1.0
+
+
+def unit(text: str) -> str:
+    """A unit as it is printed, powers included."""
+    return re.sub(r"m3\b", "m³", text).replace("^2", "²")
+
+
+def load(store: str | Path) -> xr.Dataset:
+    """The finished scenarios of a store, trajectories unread; attributes ``missing``, ``total`` and ``store`` besides.
+
+    Raises:
+        InputError: if there is no store, or no scenario of it is finished.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Damaged in")  # such scenarios are counted as missing
+        data = open_study(store)
+    there = np.flatnonzero(data[FLAG].values > 0)
+    if not len(there):
+        raise InputError(
+            "store",
+            str(store),
+            f"a finished scenario ({data.sizes['scenario']} in the study)",
+            "Give the command of the study to compute them",
+        )
+    facts = {"missing": data.sizes["scenario"] - len(there), "total": data.sizes["scenario"]}
+    return data.isel(scenario=there).assign_attrs({**facts, "store": str(store)})
+
+
+def figure_of(data: xr.Dataset, name: str) -> xr.DataArray:
+    """A key figure over the scenarios, or an `InputError` that names it."""
+    if name not in data.data_vars:
+        raise InputError(name, sorted(map(str, data.data_vars)), f"the key figure {name} in the store")
+    return data[name]
+
+
+def deviation(data: xr.Dataset, cv: str | None = None, name: str = "mean_absolute_deviation") -> xr.DataArray:
+    """A deviation per scenario: of one CV in its unit, or the mean over the CVs of deviation / thesis deadzone [1]."""
+    values = figure_of(data, name)
+    if cv is not None:
+        return values.sel(cv=cv)
+    scale = xr.DataArray([THESIS_DEADZONE[str(name)] for name in data.cv.values], dims="cv")
+    return (values / scale).mean("cv", skipna=False)
+
+
+def columns(data: xr.Dataset) -> dict[str, np.ndarray]:
+    """Values of the columns that differ between scenarios."""
+    own = {
+        str(name): coord.values
+        for name, coord in data.coords.items()
+        if coord.dims == ("scenario",) and name not in ("scenario", "scenario_hash")
+    }
+    return {name: values for name, values in own.items() if len(set(values.tolist())) > 1}
+
+
+def sweep_axes(data: xr.Dataset) -> list[SweepAxis]:
+    """What varies, in the order of the study; controller and actuator as one axis, columns that move together as one."""
+    out: list[SweepAxis] = []
+    found = columns(data)
+    for key, values in found.items():
+        if key in CONTROLLER:
+            if not any(axis.key == "controller" for axis in out):
+                out.append(SweepAxis("controller", "controller", "", controllers(data)))
+            continue
+        if key in ("prediction_horizon", "control_horizon") and _decides(found.get("blocks"), values):
+            continue
+        attrs = data[key].attrs
+        if values.dtype.kind == "f" and not np.isfinite(values).all():  # a limit that does not bind
+            values = np.array([f"{value:g}" for value in values], dtype=object)
+        axis = SweepAxis(key, attrs.get("long_name", key), attrs.get("units", ""), values)
+        for i, known in enumerate(out):
+            alike = known.numeric == axis.numeric and known.key != "controller"
+            if alike and _decides(known.values, values) and _decides(values, known.values):
+                out[i] = dataclasses.replace(known, linked=(*known.linked, key))
+                break
+        else:
+            out.append(axis)
+    return out
+
+
+def _decides(first: np.ndarray | None, second: np.ndarray) -> bool:
+    """Whether equal values of the first mean equal values of the second."""
+    if first is None:
+        return False
+    return len(set(zip(first.tolist(), second.tolist(), strict=True))) == len(set(first.tolist()))
+
+
+def setting(data: xr.Dataset, key: str):
+    """What the base of the study says of a key; its default if the base is silent, None if the store does not know."""
+    if key in data.coords:  # an axis of one value
+        return data[key].values[0]
+    definition = provenance(data, "definition")
+    if not isinstance(definition, dict):
+        return None
+    bases = [definition.get("base", {})]
+    if provenance(data, "quick"):
+        bases.insert(0, definition.get("quick", {}).get("base", {}))
+    for body in bases:
+        for name in key.split("."):
+            body = body.get(name) if isinstance(body, dict) else None
+        if body is not None:
+            return body
+    return thesis_setting(key)
+
+
+def thesis_setting(key: str):
+    """Value of a key in the thesis; None if a tuning does not fix it."""
+    section, _, rest = key.partition(".")
+    field, _, channel = rest.partition(".")
+    if section == "tuning" and field in TUNINGS["thesis"]:
+        value = TUNINGS["thesis"][field]
+        return value[channel] if channel else value
+    return FIELDS[key].default if key in FIELDS else None
+
+
+def thesis_tuning(data: xr.Dataset) -> np.ndarray:
+    """Which scenarios have the tuning and blocking of the thesis, ``"scenario"``; none in a study that varies neither."""
+    found = columns(data)
+    varied = [key for key in found if key in TUNING or key.startswith("tuning.")]
+    mask = np.full(data.sizes["scenario"], bool(varied))
+    for key in varied:
+        wanted = thesis_setting(key)
+        if wanted is not None:
+            mask &= found[key] == (wanted if found[key].dtype.kind in "biuf" else as_text(wanted))
+    for key in (*DECIDING, "preset", "soft"):
+        value = None if key in found else setting(data, key)
+        if value is not None:
+            mask &= (
+                as_text(value) == as_text(thesis_setting(key))
+                if isinstance(value, str | bool)
+                else value == thesis_setting(key)
+            )
+        elif key in DECIDING and key not in found:  # nothing can be said without them
+            mask &= False
+    return mask
+
+
+def controller_of(data: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Kind of the controller and kind of the choke actuator of each scenario."""
+    out = []
+    for key in CONTROLLER:
+        if key in data.coords:
+            out.append(data[key].values)
+        else:
+            out.append(
+                np.full(data.sizes["scenario"], setting(data, key) or FIELDS[key].default, dtype=object)
+            )
+    return out[0], out[1]
+
+
+def controllers(data: xr.Dataset) -> np.ndarray:
+    """The controller of each scenario in words; the choke only where it varies."""
+    kind, actuator = controller_of(data)
+    words = [f"{one} MPC" for one in kind]
+    if len(set(actuator.tolist())) > 1:
+        words = [f"{word}, {one} choke" for word, one in zip(words, actuator, strict=True)]
+    return np.array(words, dtype=object)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Variant:
+    """Scenarios that differ only in what no controller chooses.
+
+    Attributes:
+        label: what sets them apart from other variants.
+        colour: of the controller, the same in every figure.
+        rows: positions of its scenarios.
+    """
+
+    label: str
+    colour: str
+    rows: np.ndarray
+
+
+def variants(data: xr.Dataset, axes: list[SweepAxis]) -> list[Variant]:
+    """The scenarios by everything that a controller or an operator chooses."""
+    chosen = [axis for axis in axes if not axis.uncertain]
+    keys = list(zip(*(axis.values.tolist() for axis in chosen), strict=True)) or [()] * data.sizes["scenario"]
+    kind, actuator = controller_of(data)
+    out: list[Variant] = []
+    for i, key in enumerate(dict.fromkeys(keys)):
+        rows = np.flatnonzero([other == key for other in keys])
+        words = [
+            axis.text(value)
+            if axis.key in ("controller", "reference")
+            else f"{axis.label} {axis.text(value)}"
+            for axis, value in zip(chosen, key, strict=True)
+        ]
+        colour = style.colour(str(kind[rows[0]]), str(actuator[rows[0]]), i)
+        if colour in [known.colour for known in out]:  # the controller alone does not tell them apart
+            colour = style.SPARE_COLOURS[i % len(style.SPARE_COLOURS)]
+        label = ", ".join(words) or f"{kind[rows[0]]} MPC, {actuator[rows[0]]} choke"
+        out.append(Variant(label, colour, rows))
+    return out

@@ -1,0 +1,1 @@
+"""Definitions of studies: comparisons and sweeps as typed, strictly read data."""

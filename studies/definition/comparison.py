@@ -1,0 +1,246 @@
+"""What a study is, as typed data: what is hashed and stored with its results.
+
+Unknown keys, wrong types and impossible values are refused with the path of the offending key before anything
+is computed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from jaxmpc.errors import InputError
+from jaxmpc.loop.reference import Reference
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import Tuning
+from studies.definition import presets
+
+PlantKind = Literal["fmu", "jax"]
+PLANTS: tuple[PlantKind, ...] = ("fmu", "jax")
+
+
+class ReferenceDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Setpoints over time; see `jaxmpc.loop.reference.Reference`.
+
+    Attributes:
+        times: change times [s].
+        setpoints: one row per change, in CV order [CV unit].
+        duration: length of the run [s].
+    """
+
+    times: tuple[float, ...]
+    setpoints: tuple[tuple[float, ...], ...]
+    duration: float
+
+    @classmethod
+    def of(cls, reference: Reference) -> ReferenceDefinition:
+        """The definition of an existing reference."""
+        return cls(
+            tuple(reference.times.tolist()),
+            tuple(tuple(row) for row in reference.setpoints.tolist()),
+            reference.duration,
+        )
+
+    def build(self) -> Reference:
+        """The checked reference."""
+        return Reference(self.times, self.setpoints, self.duration)
+
+
+class TuningChange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Another tuning from some time on.
+
+    Attributes:
+        at: time from which it holds [s]; the first sample at or after it is the first that it decides.
+        changes: fields of `jaxmpc.problem.tuning.Tuning` that replace those of the tuning before.
+    """
+
+    at: float
+    changes: dict[str, Any]
+
+
+class ControllerDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One controller and the actuator that it drives.
+
+    Attributes:
+        name: short and unique, the coordinate of the results.
+        label: for legends.
+        kind: ``continuous`` or ``mixed-integer`` MPC.
+        actuator: ``continuous`` or ``step`` choke.
+        blocking: ``moves``, ``inputs`` or ``none``; see `studies.definition.presets.structure`.
+        tuning: name of a preset in `studies.definition.presets.TUNINGS`.
+        changes: fields of `jaxmpc.problem.tuning.Tuning` that replace those of the preset.
+        then: later tunings, in order of time; the controller keeps its state.
+        open_loop_from: the plan of this time [s] is carried out to its end, whatever the well does; never if None.
+        time_limit: of one step [s], for a mixed-integer controller; None for none.
+        mean_move_mode: ``reactive`` or ``predictive``; see `jaxmpc.problem.structure.Structure`.
+        schedule: whether the model follows the MVs, see `jaxmpc.controller.schedule`.
+    """
+
+    name: str
+    label: str
+    kind: Literal["continuous", "mixed-integer"]
+    actuator: Literal["continuous", "step"]
+    blocking: Literal["moves", "inputs", "none"] = "moves"
+    tuning: str = "thesis"
+    changes: dict[str, Any] = {}
+    then: tuple[TuningChange, ...] = ()
+    open_loop_from: float | None = None
+    time_limit: float | None = None
+    mean_move_mode: Literal["reactive", "predictive"] = "reactive"
+    schedule: bool = False
+
+    def structure(self) -> Structure:
+        """The checked structure."""
+        shape = presets.structure(self.blocking, integer=self.kind == "mixed-integer")
+        return dataclasses.replace(shape, mean_move_mode=self.mean_move_mode)
+
+    def build_tuning(self) -> Tuning:
+        """The checked tuning that the run starts with."""
+        return presets.tuning(self.structure(), self.tuning, self.changes)
+
+    def later_tunings(self) -> tuple[tuple[float, Tuning], ...]:
+        """The checked tunings of `then`, with the times from which they hold [s].
+
+        Raises:
+            InputError: naming the entry of `then`.
+        """
+        out, changes = [], dict(self.changes)
+        for i, change in enumerate(self.then):
+            changes |= change.changes
+            try:
+                tuning = presets.tuning(self.structure(), self.tuning, changes)
+            except InputError as error:
+                field = f"then[{i}].changes.{error.field.removeprefix('tuning.')}"
+                raise InputError(field, error.value, error.expected, error.hint) from None
+            out.append((change.at, tuning))
+        return tuple(out)
+
+    def resolved(self) -> dict[str, Any]:
+        """Every number that this controller runs with, presets filled in."""
+        out = {
+            "kind": self.kind,
+            "actuator": self.actuator,
+            "structure": dataclasses.asdict(self.structure()),
+            "tuning": _fields(self.build_tuning()),
+        }
+        if self.then:
+            out["then"] = [{"at": at, "tuning": _fields(tuning)} for at, tuning in self.later_tunings()]
+        for key in ("open_loop_from", "time_limit"):
+            if getattr(self, key) is not None:
+                out[key] = getattr(self, key)
+        if self.schedule:
+            out["schedule"] = True
+        return out
+
+    def check(self, duration: float) -> None:
+        """Build everything once.
+
+        Args:
+            duration: of the run [s].
+
+        Raises:
+            InputError: naming the field, by its path in the controller.
+        """
+        dt = self.structure().dt
+        self.build_tuning()
+        self.later_tunings()
+        before = 0.0
+        for i, change in enumerate(self.then):
+            earlier = "the start" if i == 0 else "the change before"
+            if not before + dt <= change.at <= duration - dt:
+                raise InputError(
+                    f"then[{i}].at",
+                    change.at,
+                    f"a time from {before + dt:g} s, a sample after {earlier}, to {duration - dt:g} s",
+                )
+            before = change.at
+        start = self.open_loop_from
+        if start is not None and not before <= start <= duration - dt:
+            raise InputError(
+                "open_loop_from",
+                start,
+                f"a time from {before:g} s, the last change of tuning, to {duration - dt:g} s",
+            )
+        if self.time_limit is not None:
+            if self.kind != "mixed-integer":
+                raise InputError(
+                    "time_limit", self.time_limit, "None: only mixed-integer controllers have limits"
+                )
+            if not 0 < self.time_limit < np.inf:
+                raise InputError("time_limit", self.time_limit, "a positive time of one step [s]")
+
+
+def _fields(tuning: Tuning) -> dict[str, Any]:
+    return {f.name: np.asarray(getattr(tuning, f.name)).tolist() for f in dataclasses.fields(tuning)}
+
+
+class ComparisonDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Several controllers over one reference on one plant.
+
+    Attributes:
+        name: of the study.
+        title: for reports.
+        plant: ``fmu`` or ``jax``.
+        controllers: in the order of reports.
+        reference: setpoints.
+        disturbance: times [s] and reservoir-pressure offsets [bar], each held until the next; none before the first.
+    """
+
+    name: str
+    title: str
+    plant: PlantKind
+    controllers: tuple[ControllerDefinition, ...]
+    reference: ReferenceDefinition
+    disturbance: tuple[tuple[float, float], ...] = ()
+
+    def offsets(self, dt: float) -> np.ndarray:
+        """Reservoir-pressure offset at every sample of `dt` [s], ``"sample"`` [bar]."""
+        time = np.arange(self.reference.build().samples(dt)) * dt
+        starts = np.array([start for start, _ in self.disturbance])
+        index = np.searchsorted(starts, time + 1e-9 * dt, side="right")
+        return np.array([0.0, *(offset for _, offset in self.disturbance)])[index]
+
+    def check(self) -> None:
+        """Build everything once, so that bad values are refused before a run.
+
+        Raises:
+            InputError: naming the field.
+        """
+        if self.plant not in PLANTS:
+            raise InputError("plant", self.plant, f"one of {', '.join(PLANTS)}")
+        names = [controller.name for controller in self.controllers]
+        if not names or len(set(names)) != len(names):
+            raise InputError("controllers", names, "one or more controllers with distinct names")
+        reference = self.reference.build()
+        first = self.controllers[0].structure()
+        for controller in self.controllers:
+            structure = controller.structure()
+            try:
+                controller.check(reference.duration)
+            except InputError as error:
+                field = f"controllers.{controller.name}.{error.field}"
+                raise InputError(field, error.value, error.expected, error.hint) from None
+            if structure.dt != first.dt:
+                raise InputError(
+                    f"controllers.{controller.name}.dt", structure.dt, f"{first.dt} s like the others"
+                )
+            if reference.cv_count != structure.cv_count:
+                raise InputError(
+                    "reference.setpoints",
+                    f"{reference.cv_count} columns",
+                    f"{structure.cv_count} columns, one per CV ({', '.join(structure.cv_names)})",
+                )
+        if reference.samples(first.dt) < 1:
+            raise InputError("reference.duration", reference.duration, f"at least one sample of {first.dt} s")
+        last = -1.0
+        for i, (start, offset) in enumerate(self.disturbance):
+            if not max(last, 0.0) <= start < reference.duration or start == last:
+                raise InputError(
+                    f"disturbance[{i}][0]", start, f"increasing times from 0 to {reference.duration:g} s"
+                )
+            if not np.isfinite(offset):
+                raise InputError(f"disturbance[{i}][1]", offset, "a finite pressure offset [bar]")
+            last = start

@@ -1,0 +1,292 @@
+"""The keys of a sweep study: everything that `[base]` can set and an axis can vary, with unit, meaning and default.
+
+A key is the path of the setting below `[base]`, for example ``tuning.deadzone.gas_rate``. `FIELDS` is the one table of them:
+the definition is checked against it, axes take their units and labels from it, and `docs/studies.md` lists it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from decimal import Decimal
+from typing import Any, Literal
+
+import numpy as np
+
+from jaxmpc.errors import InputError
+from jaxmpc.problem.tuning import CV_FIELDS, LIMITS, MV_FIELDS, UNITS
+from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS, WellParameters
+from studies.definition import presets, references
+
+LONGEST = 10_000  # samples of a horizon; more would not fit into memory
+Kind = Literal["number", "whole", "flag", "text", "lengths"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Field:
+    """One key.
+
+    Attributes:
+        key: its path below ``[base]``.
+        label: what it is, for legends and tables.
+        unit: of a number ("1" without unit, "" for what is not a number).
+        kind: ``number``, ``whole`` number, ``flag`` (true or false), ``text``, or ``lengths`` (of blocks).
+        default: what holds where nothing is given; None where another key or the preset decides.
+        choices: the texts that are accepted, where there are few.
+        shape: whether it fixes the shape of the compiled program.
+        infinite: whether infinity is accepted, as a limit that does not bind.
+        low, high: accepted range, as far as it does not follow from the typed objects.
+    """
+
+    key: str
+    label: str
+    unit: str
+    kind: Kind = "number"
+    default: Any = None
+    choices: tuple[str, ...] = ()
+    shape: bool = False
+    infinite: bool = False
+    low: float = -math.inf
+    high: float = math.inf
+
+    @property
+    def numeric(self) -> bool:
+        """Whether its values are numbers, in scenario coordinates too."""
+        return self.kind in ("number", "whole")
+
+    @property
+    def expected(self) -> str:
+        """What a value must be, in words, with the unit."""
+        if self.kind == "flag":
+            return "true or false"
+        if self.kind == "text":
+            return "one of " + ", ".join(self.choices)
+        if self.kind == "lengths":
+            return f"lengths of blocks in whole samples, 1 or more and {LONGEST} together at most, such as [1, 1, 2, 4]"
+        words = (
+            "a whole number" if self.kind == "whole" else "a number" if self.infinite else "a finite number"
+        )
+        if self.low > -math.inf and self.high < math.inf:
+            words += f" from {self.low:.10g} to {self.high:.10g}"
+        elif self.low > -math.inf:
+            words += f" of {self.low:g} or more"
+        return f"{words} [{self.unit}]" + (" or inf for no limit" if self.infinite else "")
+
+    def check(self, path: str, value: Any) -> Any:
+        """The value in its plain type, or an `InputError` that names `path`.
+
+        Numbers become floats, whole numbers ints, lengths tuples of ints.
+        """
+        expected = f"{self.expected} for {self.key}"
+        if self.kind == "flag":
+            if not isinstance(value, bool):
+                raise InputError(path, value, expected)
+            return value
+        if self.kind == "text":
+            if not isinstance(value, str) or value not in self.choices:
+                raise InputError(path, value, expected, near(value, self.choices))
+            return value
+        if self.kind == "lengths":
+            whole = isinstance(value, (list, tuple)) and all(type(v) is int and v >= 1 for v in value)
+            if not whole or not 1 <= sum(value) <= LONGEST:
+                raise InputError(path, value, expected)
+            return tuple(value)
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise InputError(path, value, expected)
+        if isinstance(value, int) and value.bit_length() > 63:  # no float has room for some of them
+            raise InputError(path, f"{value.bit_length()} bits", expected)
+        if math.isnan(value):
+            raise InputError(path, value, expected)
+        if math.isinf(value) and not self.infinite:
+            raise InputError(path, value, expected)
+        if self.kind == "whole" and value != int(value):
+            raise InputError(path, value, expected)
+        if not self.low <= value <= self.high:
+            raise InputError(path, value, expected)
+        return int(value) if self.kind == "whole" else float(value)
+
+    def parse(self, path: str, text: str) -> Any:
+        """The value that a cell of a CSV file holds; lengths are separated by spaces."""
+        text = text.strip()
+        value: Any = text
+        try:
+            if self.kind == "flag":
+                value = {"true": True, "false": False}.get(text.lower(), text)
+            elif self.kind == "lengths":
+                value = [int(part) for part in text.split()]
+            elif self.kind == "whole":
+                value = int(text)
+            elif self.kind == "number":
+                value = float(text)
+        except ValueError:
+            raise InputError(path, text, f"{self.expected} for {self.key}") from None
+        return self.check(path, value)
+
+    def column(self, values: list[Any]) -> np.ndarray:
+        """Values as a scenario coordinate: floats, or texts as an object array."""
+        if self.numeric:
+            return np.array(values, dtype=np.float64)
+        out = np.empty(len(values), dtype=object)
+        out[:] = [as_text(value) for value in values]
+        return out
+
+
+def as_text(value: Any) -> str:
+    """A flag, text or list of lengths as it stands in a coordinate and in a CSV file."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return value if isinstance(value, str) else " ".join(str(v) for v in value)
+
+
+def near(given: Any, known) -> str:
+    """``Did you mean ...?`` for the closest known names; empty where none is close."""
+    found = difflib.get_close_matches(str(given), list(known), n=3, cutoff=0.6)
+    return f"Did you mean {' or '.join(found)}?" if found else ""
+
+
+# -------------------------------------------------------------------------------------------------------- the well
+
+# What one unit of the definition is in SI units, as a power of ten; fields not named here are in SI units.
+_BAR = ("reservoir_pressure", "manifold_pressure", "supply_pressure", "supply_droop", "supply_limit")
+PLANT_UNITS: dict[str, tuple[str, int]] = {
+    **dict.fromkeys((*_BAR, "trip_start", "trip_end", "root_width"), ("bar", 5)),
+    "productivity": ("kg/s/bar", -5),
+    "tubing_length": ("m", 0),
+    "tubing_diameter": ("m", 0),
+    "annulus_volume": ("m3", 0),
+    "perforation_depth": ("m", 0),
+    "liquid_density": ("kg/m3", 0),
+    "molar_mass": ("kg/mol", 0),
+    "tubing_temperature": ("K", 0),
+    "annulus_temperature": ("K", 0),
+    "near_well_time": ("s", 0),
+    "gas_oil_ratio": ("m3/m3", 0),
+    "choke_conductance": ("m2", 0),
+    "injection_conductance": ("m2", 0),
+    "slip_velocity": ("m/s", 0),
+    "slip_floor": ("m/s", 0),
+    "choke_time": ("s", 0),
+    "lift_time": ("s", 0),
+    "equalising_rate": ("1/s", 0),
+}
+PLANT_FIELDS = tuple(field.name for field in dataclasses.fields(WellParameters))
+SHIPPED = {name: float(getattr(WellParameters(), name)) for name in PLANT_FIELDS}  # SI units
+
+
+def plant_si(name: str, value: float) -> float:
+    """A well parameter in SI units; shifting the decimal point keeps 78.2901 bar equal to 7829010 Pa."""
+    power = PLANT_UNITS.get(name, ("1", 0))[1]
+    return float(Decimal(repr(float(value))).scaleb(power)) if power else float(value)
+
+
+# ------------------------------------------------------------------------------------------------------- the table
+
+_TUNING_LABELS = {
+    "cv_weight": "weight of the deviation of",
+    "soft_quadratic": "quadratic weight beyond the deadzone of",
+    "soft_linear": "linear weight beyond the deadzone of",
+    "deadzone": "deadzone of",
+    "cv_low": "low limit of",
+    "cv_high": "high limit of",
+    "slack_weight": "price of limit violation of",
+    "move_weight": "move weight of",
+    "mv_low": "low limit of",
+    "mv_high": "high limit of",
+    "move_low": "largest move down of",
+    "move_high": "largest move up of",
+    "mean_move_limit": "limit of the mean move of",
+    "measurement_low": "least measurement that counts of",
+    "measurement_high": "largest measurement that counts of",
+    "frozen_limit": "equal measurements in a row that are too many of",
+    "bad_limit": "bad measurements in a row that switch off",
+    "bias_decay": "time constant of the fading bias of",
+    "demand_lead": "how far the demand may lead the position of",
+}
+_SPOKEN = {
+    name: "the " + {"gas_lift": "gas lift"}.get(name, name.replace("_", " "))
+    for name in (*CV_NAMES, *MV_NAMES)
+}
+
+
+def _unit(field: str, unit: str) -> str:
+    """Unit of a tuning field for a CV or MV of this unit."""
+    words = UNITS[field]
+    if words in ("s", "samples"):
+        return words
+    short = unit if unit == "%" else f"({unit})"
+    if words.startswith("1/"):
+        return "1/" + (f"{short}^2" if words.endswith("^2") else unit if unit == "%" else short)
+    return unit + (" per sample" if words.endswith("per sample") else "")
+
+
+def _table() -> dict[str, Field]:
+    samples: dict[str, Any] = dict(kind="whole", low=1, high=LONGEST, shape=True)
+    first = presets.structure()
+    out = [
+        Field("controller", "controller", "", "text", "mixed-integer", ("continuous", "mixed-integer"), True),
+        Field("actuator", "choke actuator", "", "text", "step", ("continuous", "step"), True),
+        Field("preset", "tuning preset", "", "text", "thesis", tuple(presets.TUNINGS)),
+        Field("soft", "Soft MPC", "", "flag", True),
+        Field("blocking", "blocking mode", "", "text", "moves", ("moves", "inputs", "none"), True),
+        Field("blocks", "lengths of the blocks", "", "lengths", first.blocks, shape=True),
+        Field("prediction_horizon", "prediction horizon", "samples", default=250, **samples),
+        Field("control_horizon", "control horizon", "samples", **samples),
+        Field("first_penalised", "first penalised sample", "samples", default=1, **samples),
+        Field("mean_move_window", "window of the mean move", "samples", default=25, **samples),
+        Field(
+            "mean_move_mode",
+            "mode of the mean-move limit",
+            "",
+            "text",
+            "reactive",
+            ("reactive", "predictive"),
+            True,
+        ),
+    ]
+    for fields, names, units in ((CV_FIELDS, CV_NAMES, CV_UNITS), (MV_FIELDS, MV_NAMES, MV_UNITS)):
+        for field in fields:
+            for name, unit in zip(names, units, strict=True):
+                key, label = f"tuning.{field}.{name}", f"{_TUNING_LABELS[field]} {_SPOKEN[name]}"
+                out.append(Field(key, label, _unit(field, unit), infinite=field in LIMITS))
+    out += [
+        Field("tuning.bias_cutoff", "cut-off of the bias filter", "rad/s", infinite=True),
+        Field("tuning.oscillation_rows", "no reversal from one sample to the next", "", "flag", True),
+        # the step test moves the choke by 2 % from here, and stays within its range
+        Field("model.choke", "choke of the model's working point", "%", default=50.0, low=0, high=98),
+        Field("model.lift", "gas lift of the model's working point", "m3/h", default=7500.0, low=0),
+    ]
+    for name in PLANT_FIELDS:
+        label = name.replace("_", " ")
+        out.append(Field(f"plant.{name}", f"{label} of the well", PLANT_UNITS.get(name, ("1", 0))[0]))
+        out.append(Field(f"plant_scale.{name}", f"{label} of the well, relative", "1", low=0))
+    for name, unit in zip(CV_NAMES, CV_UNITS, strict=True):
+        out.append(Field(f"noise.{name}", f"noise of {_SPOKEN[name]}", unit, default=0.0, low=0))
+    out += [
+        Field("seed", "seed of the noise", "1", "whole", 0, low=0, high=2**32 - 1),
+        Field("sensor_fault.time", "time of the sensor fault", "s", low=0),
+        Field("sensor_fault.duration", "duration of the sensor fault", "s", low=0),
+        Field("sensor_fault.size", "size of the spike", "CV unit"),
+        Field("position_feedback", "predictions from the positions of the actuators", "", "flag", False),
+        Field("disturbance.time", "time of the pressure step", "s", low=0),
+        Field("disturbance.offset", "step of the reservoir pressure", "bar"),
+        Field("reference", "reference", "", "text", "thesis", tuple(references.NAMED), True),
+        Field("duration", "length of the run", "s", low=0, shape=True),
+    ]
+    return {field.key: field for field in out}
+
+
+FIELDS = _table()
+
+
+def find(path: str, key: Any) -> Field:
+    """The field of a key, or an `InputError` at `path` that names similar keys."""
+    if key not in FIELDS:
+        raise InputError(path, key, "a key of docs/studies.md", near(key, FIELDS) or similar_end(key))
+    return FIELDS[key]
+
+
+def similar_end(key: Any) -> str:
+    """A hint for keys whose last name exists elsewhere, such as ``deadzone.gas_rate`` without ``tuning``."""
+    found = [known for known in FIELDS if known.endswith("." + str(key).rpartition(".")[2])][:3]
+    return f"Did you mean {' or '.join(found)}?" if found else ""

@@ -1,0 +1,411 @@
+"""Scenarios of a sweep study as numbers: presets filled in, units those of `jaxmpc`, one row per scenario.
+
+Everything is done on whole columns, so that ten thousand scenarios take well under a second, and everything is checked here:
+`Inputs` that exist describe runs that can start. Only what fixes the shape of a compiled program (structure, reference,
+length) is built as typed objects, once per distinct combination.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from msgspec import UNSET
+
+from jaxmpc.errors import InputError
+from jaxmpc.loop.noise import check_deviation, check_seed
+from jaxmpc.loop.reference import Reference
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import CV_FIELDS, DEFAULTS, LIMIT_PAIRS, LIMITS, MV_FIELDS, make_tuning
+from jaxmpc.process.plant import check_inputs
+from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES, WellParameters, check_parameters
+from studies.definition import presets, references
+from studies.definition.axes import AxisTable
+from studies.definition.fields import FIELDS, PLANT_FIELDS, SHIPPED, plant_si
+from studies.definition.sections import InlineReference
+from studies.definition.sweep import StudyDefinition
+
+NAMES = {**dict.fromkeys(CV_FIELDS, CV_NAMES), **dict.fromkeys(MV_FIELDS, MV_NAMES)}
+SHAPE_KEYS = tuple(field.key for field in FIELDS.values() if field.shape)
+LONGEST_RUN = 1_000_000  # samples
+LISTED = (
+    200  # entries of an axis up to which each is checked by itself, instead of the smallest and the largest
+)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Variant:
+    """What fixes shapes and setpoints, shared by all scenarios that agree in it.
+
+    Attributes:
+        kind: ``continuous`` or ``mixed-integer``.
+        actuator: ``continuous`` or ``step``.
+        structure: of the controller.
+        reference: setpoints, cut to the length of the run.
+        samples: length of the run [samples].
+    """
+
+    kind: str
+    actuator: str
+    structure: Structure
+    reference: Reference
+    samples: int
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Inputs:
+    """All scenarios in the units of `jaxmpc`; an array that does not vary has one row for all.
+
+    Attributes:
+        variants: distinct shapes.
+        variant: ``"scenario"``, which of them.
+        tuning: per field of `jaxmpc.problem.tuning.Tuning` ``"scenario name"``, and ``"scenario"`` for the bias cut-off.
+        plant: per field of `jaxmpc.process.well.equations.WellParameters` ``"scenario"``, SI units.
+        point: ``"scenario 2"``, working point of the model: choke [%], gas lift [m3/h].
+        noise: ``"scenario cv"``, standard deviation [CV unit].
+        seed: ``"scenario"``, of the noise.
+        pressure: ``"scenario step 2"``, steps of the reservoir pressure: time [s], offset from then on [bar].
+        fault_kinds: CV and kind of every sensor fault.
+        faults: ``"scenario fault 3"``, time [s], duration [s] and size [CV unit] of the sensor faults.
+        told: ``"scenario"``, whether the controller is told where the actuators stand.
+    """
+
+    variants: tuple[Variant, ...]
+    variant: np.ndarray
+    tuning: dict[str, np.ndarray]
+    plant: dict[str, np.ndarray]
+    point: np.ndarray
+    noise: np.ndarray
+    seed: np.ndarray
+    pressure: np.ndarray
+    fault_kinds: tuple[tuple[str, str], ...]
+    faults: np.ndarray
+    told: np.ndarray
+
+
+def row(array: np.ndarray, k: int) -> np.ndarray:
+    """Scenario k of an array that may have one row for all."""
+    return array[k if len(array) > 1 else 0]
+
+
+class Settings:
+    """Base settings and axes of a definition: the value of a key in every scenario."""
+
+    def __init__(self, definition: StudyDefinition, table: AxisTable):
+        self.base, self.table, self.count = definition.base, table, len(table)
+
+    def given(self, key: str) -> bool:
+        """Whether the base or an axis sets the key."""
+        return key in self.base or self.table.column(key) is not None
+
+    def value(self, key: str, scenario: int) -> Any:
+        """In one scenario, plain and typed; the default where nothing is given."""
+        found = self.table.column(key)
+        if found is None:
+            return self.base.get(key, FIELDS[key].default)
+        return found[1][found[2][scenario]]
+
+    def numbers(self, key: str, change: Callable[[float], float] | None = None) -> np.ndarray:
+        """A numeric key ``"scenario"``, of length 1 if it does not vary; `change` converts each entry."""
+        found = self.table.column(key)
+        values = [self.base.get(key, FIELDS[key].default)] if found is None else found[1]
+        out = np.array(values if change is None else [change(v) for v in values], dtype=np.float64)
+        return out if found is None else out[found[2]]
+
+    def combinations(self, keys: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+        """First scenario of each distinct combination of some keys' values, and each scenario's combination."""
+        found = [column for key in keys if (column := self.table.column(key)) is not None]
+        if not found:
+            return np.array([0]), np.zeros(self.count, dtype=int)
+        numbered = []
+        for _, values, index in found:  # entries with equal values are one combination
+            order = {value: n for n, value in enumerate(dict.fromkeys(values))}
+            numbered.append(np.array([order[value] for value in values])[index])
+        _, first, inverse = np.unique(np.stack(numbered, 1), axis=0, return_index=True, return_inverse=True)
+        order = np.argsort(first)  # by first appearance
+        rank = np.empty_like(order)
+        rank[order] = np.arange(len(order))
+        return first[order], rank[inverse.ravel()]
+
+
+def resolve(definition: StudyDefinition, table: AxisTable) -> Inputs:
+    """Numbers of every scenario, checked.
+
+    Raises:
+        InputError: naming the entries of the axes (or the base) whose combination is refused.
+    """
+    settings = Settings(definition, table)
+    variants, variant = _variants(settings)
+    kinds = np.array([v.kind == "mixed-integer" for v in variants])
+    inputs = Inputs(
+        variants=variants,
+        variant=variant,
+        tuning=_tuning(settings, kinds[variant] if len(set(kinds)) > 1 else kinds[:1]),
+        plant=_plant(settings),
+        point=_stacked(settings, ("model.choke", "model.lift")),
+        noise=_stacked(settings, [f"noise.{name}" for name in CV_NAMES]),
+        seed=settings.numbers("seed").astype(np.int64),
+        pressure=_pressure(settings, variants, variant),
+        fault_kinds=tuple((fault.cv, fault.kind) for fault in settings.base.get("sensor_fault", ())),
+        faults=_sensor_faults(settings, variants, variant),
+        told=settings.numbers("position_feedback").astype(bool),
+    )
+    check_inputs(inputs.point[:, 0], inputs.point[:, 1])
+    check_deviation(inputs.noise, len(CV_NAMES))
+    check_seed(inputs.seed)
+    return inputs
+
+
+def _stacked(settings: Settings, keys: Sequence[str]) -> np.ndarray:
+    return np.stack(np.broadcast_arrays(*[settings.numbers(key) for key in keys]), axis=1)
+
+
+# --------------------------------------------------------------------------------------------------------- shapes
+
+
+def _variants(settings: Settings) -> tuple[tuple[Variant, ...], np.ndarray]:
+    firsts, index = settings.combinations(SHAPE_KEYS)
+    cut: dict[tuple[Any, Any], Reference] = {}
+    variants = []
+    for k in firsts.tolist():
+        value = lambda key, k=k: settings.value(key, k)  # noqa: E731
+        structure = _structure(settings, k)
+        wanted = value("reference"), value("duration")
+        if wanted not in cut:
+            cut[wanted] = _reference(settings, k, *wanted)
+        reference = cut[wanted]
+        samples = reference.samples(structure.dt)
+        if samples < 1:
+            raise InputError(
+                settings.table.blame(["duration"], k), wanted[1], f"one sample of {structure.dt:g} s or more"
+            )
+        if samples > LONGEST_RUN:
+            path = settings.table.blame(["duration" if wanted[1] is not None else "reference"], k)
+            raise InputError(path, f"{samples} samples", f"a run of at most {LONGEST_RUN} samples")
+        variants.append(Variant(value("controller"), value("actuator"), structure, reference, samples))
+    return tuple(variants), index
+
+
+def _structure(settings: Settings, k: int) -> Structure:
+    """The structure of one scenario; without a control horizon the blocks decide it."""
+    value = lambda key: settings.value(key, k)  # noqa: E731
+    blocks, blocking = value("blocks"), value("blocking")
+    horizon = value("control_horizon") or sum(blocks)
+    base = presets.structure("moves", integer=value("controller") == "mixed-integer")
+    same = ("prediction_horizon", "first_penalised", "mean_move_window", "mean_move_mode")
+    try:
+        return dataclasses.replace(
+            base,
+            control_horizon=horizon,
+            blocks=() if blocking == "none" else blocks,
+            blocking="moves" if blocking == "none" else blocking,
+            **{key: value(key) for key in same},
+        )
+    except InputError as error:
+        key = error.field.removeprefix("structure.")
+        partner = {"blocks": ["control_horizon"], "first_penalised": ["prediction_horizon"]}.get(key, [])
+        keys = [key, *(other for other in partner if settings.given(other))]
+        raise InputError(settings.table.blame(keys, k), error.value, error.expected, error.hint) from None
+
+
+def _reference(settings: Settings, k: int, name: Any, duration: float | None) -> Reference:
+    """A named or own reference, cut to a duration [s]; changes that the run would not reach are left out."""
+    whole = name.build() if isinstance(name, InlineReference) else references.NAMED[name]()
+    if duration is None or duration == whole.duration:
+        return whole
+    if not 0 < duration <= whole.duration:
+        path = settings.table.blame(["duration"], k)
+        raise InputError(path, duration, f"more than 0 s and at most the reference's {whole.duration:g} s")
+    kept = whole.times < duration
+    return Reference(whole.times[kept], whole.setpoints[kept], float(duration))
+
+
+# --------------------------------------------------------------------------------------------------------- tuning
+
+
+def _tuning(settings: Settings, integer: np.ndarray) -> dict[str, np.ndarray]:
+    """Tuning fields "scenario name"; `integer` ("scenario" or one for all): whether the choke moves in whole steps."""
+    firsts, preset = settings.combinations(["preset"])
+    tables = [presets.tuning_fields(settings.value("preset", k)) for k in firsts.tolist()]
+    preset = preset if len(tables) > 1 else preset[:1]
+    out = {}
+    for field, names in NAMES.items():
+        columns = []
+        for name in names:
+            key = f"tuning.{field}.{name}"
+            of_preset = np.array([_number(field, table, name) for table in tables])[preset]
+            columns.append(settings.numbers(key) if settings.given(key) else of_preset)
+            _check_tuning_entries(settings, key, field, name)
+        out[field] = np.stack(np.broadcast_arrays(*columns), axis=1)
+    for low, high in LIMIT_PAIRS:
+        smaller, larger = np.broadcast_arrays(out[low], out[high])
+        for k, i in np.argwhere(smaller > larger)[:1].tolist():
+            name = NAMES[low][i]
+            keys = [f"tuning.{field}.{name}" for field in (low, high)]
+            keys = [key for key in keys if settings.given(key)] or keys
+            raise InputError(
+                settings.table.blame(keys, k),
+                f"{low} {smaller[k, i]:g}, {high} {larger[k, i]:g}",
+                f"{low} of {name} at most its {high} [{FIELDS[f'tuning.{low}.{name}'].unit}]",
+            )
+    cutoff = "tuning.bias_cutoff"
+    _check_tuning_entries(settings, cutoff, "bias_cutoff", None)
+    of_preset = np.array([table["bias_cutoff"] for table in tables])[preset]
+    out["bias_cutoff"] = settings.numbers(cutoff) if settings.given(cutoff) else of_preset
+    rows = settings.numbers("tuning.oscillation_rows").astype(bool)
+    rows, whole = np.broadcast_arrays(rows, integer)
+    out["oscillation_rows"] = np.stack([rows & whole, np.zeros_like(whole)], axis=1)
+    return _without_soft(settings, out)
+
+
+def _without_soft(settings: Settings, out: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Soft MPC off: as hard everywhere as the soft controller is far outside its deadzone, as preset ``no-soft``."""
+    soft = settings.numbers("soft").astype(bool)
+    if soft.all():
+        return out
+    soft = soft[:, None]
+    out["cv_weight"] = out["cv_weight"] + np.where(soft, 0.0, out["soft_quadratic"])
+    for field in ("soft_quadratic", "soft_linear"):
+        out[field] = np.where(soft, out[field], 0.0)
+    return out
+
+
+def _number(field: str, preset: dict[str, Any], name: str) -> float:
+    """A preset's value of a field, or what holds where it says nothing."""
+    value = preset[field][name] if field in preset else None
+    return DEFAULTS[field] if value is None else value
+
+
+def _check_tuning_entries(settings: Settings, key: str, field: str, name: str | None) -> None:
+    """Build a tuning with one entry at a time, all else neutral.
+
+    What `make_tuning` accepts of a single number is an interval, so where an axis has many entries the smallest and the
+    largest stand for all. What it asks of two numbers together (crossed limits) is checked for every scenario.
+    """
+    found = settings.table.column(key)
+    if found is None and key not in settings.base:
+        return
+    values = [settings.base[key]] if found is None else found[1]
+    entries = (
+        range(len(values)) if len(values) <= LISTED else [int(np.argmin(values)), int(np.argmax(values))]
+    )
+    neutral = {n: (None if field in LIMITS else 0.0) for n in NAMES.get(field, ())}
+    for j in entries:
+        given = values[j] if name is None else {**neutral, name: values[j]}
+        fields = {"cv_weight": 0.0, "move_weight": 0.0, field: given}
+        try:
+            make_tuning(presets.structure(), **fields)
+        except InputError as error:
+            path = f"base.{key}" if found is None else settings.table.axes[found[0]].path(key, j)
+            expected = (
+                "0 or more" if field not in (*LIMITS, "bias_cutoff") else error.expected.partition(" [")[0]
+            )
+            unit = FIELDS[key].unit
+            raise InputError(path, values[j], f"{expected} [{unit}] for {key}") from None
+
+
+# ----------------------------------------------------------------------------------------------- well and pressure
+
+
+def _plant(settings: Settings) -> dict[str, np.ndarray]:
+    """Well parameters "scenario" in SI units, all accepted by `check_parameters`."""
+    out = {}
+    for name in PLANT_FIELDS:
+        absolute, relative = f"plant.{name}", f"plant_scale.{name}"
+        if settings.given(absolute) and settings.given(relative):
+            path = settings.table.blame([relative], 0)
+            raise InputError(
+                path, settings.value(relative, 0), f"nothing: {absolute} is set as well; choose one"
+            )
+        if settings.given(absolute):
+            out[name] = settings.numbers(absolute, lambda value, name=name: plant_si(name, value))
+        elif settings.given(relative):
+            out[name] = SHIPPED[name] * settings.numbers(relative)
+        else:
+            out[name] = np.array([SHIPPED[name]])
+    try:
+        check_parameters(WellParameters(**out))
+    except InputError as error:
+        raise _located(settings, out, error) from None
+    return out
+
+
+def _located(settings: Settings, plant: dict[str, np.ndarray], error: InputError) -> InputError:
+    """The error of the first scenario whose well is refused, with the entries that it comes from."""
+    for k in range(settings.count):
+        try:
+            check_parameters(WellParameters(**{n: float(row(values, k)) for n, values in plant.items()}))
+        except InputError as found:
+            name = found.field.removeprefix("well.")
+            names = (
+                [name, "trip_end"] if name == "trip_start" and found.expected.endswith("trip_end") else [name]
+            )
+            keys = [
+                key for n in names for key in (f"plant.{n}", f"plant_scale.{n}") if settings.given(key)
+            ] or [f"plant.{name}"]
+            value = settings.value(keys[0], k)
+            expected = found.expected.replace(" (SI units)", "").replace(" [Pa]", "")
+            path = settings.table.blame(keys, k)
+            return InputError(path, value, f"{expected} [{FIELDS[keys[0]].unit}] for {keys[0]}")
+    return error
+
+
+def _pressure(settings: Settings, variants: tuple[Variant, ...], variant: np.ndarray) -> np.ndarray:
+    """Pressure steps "scenario step 2"; every step lies within every run."""
+    return _events(settings, variants, variant, "disturbance", ("time", "offset"))
+
+
+def _sensor_faults(settings: Settings, variants: tuple[Variant, ...], variant: np.ndarray) -> np.ndarray:
+    """Sensor faults "scenario fault 3"; every one begins within every run."""
+    out = _events(settings, variants, variant, "sensor_fault", ("time", "duration", "size"))
+    _refuse(
+        settings, "sensor_fault.duration", out[:, :, 1], out[:, :, 1] <= 0, lambda _: "a duration above 0 s"
+    )
+    return out
+
+
+def _events(
+    settings: Settings,
+    variants: tuple[Variant, ...],
+    variant: np.ndarray,
+    table: str,
+    names: tuple[str, ...],
+) -> np.ndarray:
+    """What ``[[base.TABLE]]`` lists, "scenario event name"; the first name is the time, which lies within every run.
+
+    What is not given is one sample long.
+    """
+    events = settings.base.get(table, ())
+    keys = [f"{table}.{name}" for name in names]
+    varied = [key for key in keys if settings.table.column(key) is not None]
+    if varied and len(events) != 1:
+        path = settings.table.blame(varied[:1], 0)
+        expected = f"exactly one [[base.{table}]], whose {' or '.join(names)} the axis replaces"
+        raise InputError(path, f"{len(events)} of them", expected)
+    given = lambda event, name: variants[0].structure.dt if (v := getattr(event, name)) is UNSET else v  # noqa: E731
+    columns = [
+        settings.numbers(key) if key in varied else np.array([given(event, name)])
+        for event in events
+        for key, name in zip(keys, names, strict=True)
+    ]
+    if not columns:
+        return np.zeros((1, 0, len(names)))
+    out = np.stack(np.broadcast_arrays(*columns), axis=1).reshape(-1, len(events), len(names))
+    durations = np.array([v.reference.duration for v in variants])[variant]
+    late = out[:, :, 0] >= durations[:, None]
+    expected = lambda k: f"a time within the run of {durations[k]:g} s"  # noqa: E731
+    _refuse(settings, keys[0], out[:, :, 0], late, expected)
+    return out
+
+
+def _refuse(
+    settings: Settings, key: str, values: np.ndarray, wrong: np.ndarray, expected: Callable[[int], str]
+) -> None:
+    """An `InputError` for the first wrong number "scenario event" of a key of listed events, by its path."""
+    table, _, name = key.partition(".")
+    for k, i in np.argwhere(wrong)[:1].tolist():
+        axis = any(settings.table.column(f) is not None for f in FIELDS if f.startswith(f"{table}."))
+        path = settings.table.blame([key], k) if axis else f"base.{table}[{i}].{name}"
+        raise InputError(path, float(row(values, k)[i]), expected(k))

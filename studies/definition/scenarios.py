@@ -1,0 +1,432 @@
+"""A sweep study, expanded: its scenarios, the groups that share one compiled program, and the chunks that are computed.
+
+`Study` is immutable, small and picklable, so that every worker can hold one; `scenario(k)` makes the typed inputs of one run
+when they are needed. Hashes cover resolved numbers and code, so that equal scenarios of two studies have equal hashes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from msgspec import UnsetType
+
+from jaxmpc import html
+from jaxmpc.controller.measurement import SensorFault, fault_errors
+from jaxmpc.errors import InputError
+from jaxmpc.loop.reference import Reference
+from jaxmpc.loop.trajectory import AXES
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import Tuning, make_tuning
+from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES, WellParameters
+from studies.definition import models
+from studies.definition.axes import AxisTable, expand_axes
+from studies.definition.resolve import Inputs, Variant, resolve, row
+from studies.definition.sweep import StudyDefinition, load_definition
+from studies.run.estimate import MODEL_SECONDS, Work, chunk_seconds, megabytes
+from studies.store import fingerprint
+from studies.store.layout import Column
+
+KEY_FIGURES = 64  # numbers of a scenario besides trajectories
+NUMBER_BYTES = 8
+CHUNKS = 8  # at least, of a study with that many scenarios
+COMPUTING = (
+    "kpi.loop",
+    "kpi.setpoint",
+    "kpi.sweep",
+    "run.chunk",
+)  # modules of `studies` that results depend on
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scenario:
+    """The inputs of one run, typed and checked.
+
+    Attributes:
+        number: of the scenario.
+        kind: of the controller.
+        actuator: of the choke.
+        structure: of the controller; the same object for all scenarios of a group that agree in it.
+        tuning: of the controller.
+        model_point: working point ``(choke [%], gas lift [m3/h])`` at which the model is identified, on the nominal well.
+        plant: parameters of the well that is controlled.
+        reference: setpoints; the same object for scenarios with the same ones.
+        samples: length of the run.
+        noise: standard deviation ``"cv"`` [CV unit]; None without noise.
+        seed: of the noise.
+        disturbance: offset of the reservoir pressure ``"sample"`` [bar]; None without any.
+        faults: errors of failing sensors ``"sample cv"`` (`jaxmpc.controller.measurement.fault_errors`); None without any.
+        position_feedback: whether the controller is told where the actuators stand.
+    """
+
+    number: int
+    kind: Literal["continuous", "mixed-integer"]
+    actuator: Literal["continuous", "step"]
+    structure: Structure
+    tuning: Tuning
+    model_point: tuple[float, float]
+    plant: WellParameters
+    reference: Reference
+    samples: int
+    noise: np.ndarray | None
+    seed: int
+    disturbance: np.ndarray | None
+    faults: np.ndarray | None
+    position_feedback: bool
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Group:
+    """Scenarios that one compiled program computes.
+
+    Attributes:
+        kind, actuator, structure, samples: what all of them have.
+        has_limits: whether they have a finite CV limit.
+        whole_steps: most steps of a whole choke move; 0 for continuous moves.
+        switching: whether bad measurements may switch a CV off.
+        points: distinct working points of their models.
+        scenarios: their numbers, increasing.
+    """
+
+    kind: Literal["continuous", "mixed-integer"]
+    actuator: Literal["continuous", "step"]
+    structure: Structure
+    samples: int
+    has_limits: bool
+    whole_steps: int
+    switching: bool
+    points: tuple[tuple[float, float], ...]
+    scenarios: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Chunk:
+    """What is computed and stored together.
+
+    Attributes:
+        index: of the chunk.
+        group: index of its group.
+        scenarios: 1 to ``chunk_size`` scenario numbers, increasing; lanes beyond are padding.
+    """
+
+    index: int
+    group: int
+    scenarios: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Description:
+    """What a run would do; see `Study.describe`.
+
+    Attributes:
+        name: of the study.
+        scenarios: how many.
+        group_sizes: scenarios of every group.
+        chunks: how many.
+        compilations: compiled programs, one per group.
+        models: step-response models to identify.
+        samples: samples of all scenarios together.
+        stored_bytes: key figures and trajectories before compression [B].
+        seconds: rough time on 2 CPU cores [s]: identification, and what the table of `estimate` says of the chunks.
+    """
+
+    name: str
+    scenarios: int
+    group_sizes: tuple[int, ...]
+    chunks: int
+    compilations: int
+    models: int
+    samples: int
+    stored_bytes: int
+    seconds: float
+
+    def __str__(self) -> str:
+        sizes = ", ".join(str(size) for size in self.group_sizes[:12])
+        more = ", ..." if len(self.group_sizes) > 12 else ""
+        return "\n".join(
+            (
+                f"study       {self.name}",
+                f"scenarios   {self.scenarios} ({self.samples} samples in all)",
+                f"groups      {len(self.group_sizes)} of equal structure and length, of {sizes}{more} scenarios",
+                f"chunks      {self.chunks}",
+                f"to compile  {self.compilations}",
+                f"models      {self.models} to identify",
+                f"stored      {megabytes(self.stored_bytes)} before compression",
+                f"time        about {self.seconds / 60:.1f} minutes on 2 CPU cores; the run measures it by its own chunks",
+            )
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Study:
+    """All scenarios of a definition; made by `load_study` or `StudyDefinition.expand`, checked when it exists.
+
+    Attributes:
+        definition: as written, quick cuts applied.
+        count: number of scenarios.
+        columns: one coordinate per axis key, in the order of the axes.
+        groups: in the order of their first scenarios.
+        chunks: of the groups in turn, each of consecutive scenarios of one group.
+        chunk_size: lanes of every chunk: ``study.chunk_size`` or `default_chunk_size`, or the largest group if that is
+            smaller.
+    """
+
+    definition: StudyDefinition
+    count: int
+    columns: tuple[Column, ...]
+    groups: tuple[Group, ...]
+    chunks: tuple[Chunk, ...]
+    chunk_size: int
+    _inputs: Inputs
+
+    @property
+    def name(self) -> str:
+        """Of the study; ends in ``-quick`` for the quick cut."""
+        return self.definition.study.name
+
+    @property
+    def title(self) -> str:
+        """For reports."""
+        return self.definition.study.title or self.name
+
+    @property
+    def model_points(self) -> tuple[tuple[float, float], ...]:
+        """Distinct working points of all models, for `models.identify_models`."""
+        return tuple(dict.fromkeys(point for group in self.groups for point in group.points))
+
+    def scenario(self, k: int) -> Scenario:
+        """The typed inputs of scenario k."""
+        inputs, variant = self._inputs, self._variant(k)
+        fields = {name: row(values, k).tolist() for name, values in inputs.tuning.items()}
+        noise = row(inputs.noise, k)
+        return Scenario(
+            number=int(k),
+            kind=variant.kind,  # type: ignore[arg-type]
+            actuator=variant.actuator,  # type: ignore[arg-type]
+            structure=variant.structure,
+            tuning=make_tuning(variant.structure, **fields),
+            model_point=tuple(row(inputs.point, k).tolist()),
+            plant=WellParameters(**{name: float(row(values, k)) for name, values in inputs.plant.items()}),
+            reference=variant.reference,
+            samples=variant.samples,
+            noise=noise.copy() if noise.any() else None,
+            seed=int(row(inputs.seed, k)),
+            disturbance=self._disturbance(k),
+            faults=self._faults(k),
+            position_feedback=bool(row(inputs.told, k)),
+        )
+
+    def scenario_hash(self, k: int) -> str:
+        """Content hash of the numbers of scenario k and of the code that turns them into a run."""
+        inputs = self._inputs
+        self._variant(k)  # refuses numbers that are no scenario
+        noise = row(inputs.noise, k)
+        return fingerprint.content_hash(
+            self._code,
+            self._variant_hashes[inputs.variant[k]],
+            {name: row(values, k).tolist() for name, values in inputs.tuning.items()},
+            {name: float(row(values, k)) for name, values in inputs.plant.items()},
+            row(inputs.point, k).tolist(),
+            [*noise.tolist(), int(row(inputs.seed, k))] if noise.any() else None,  # no noise, no seed
+            self._disturbance(k),
+            self._faults(k),
+            bool(row(inputs.told, k)),
+        )
+
+    @functools.cached_property
+    def scenario_hashes(self) -> tuple[str, ...]:
+        """`scenario_hash` of every scenario, in order."""
+        return tuple(self.scenario_hash(k) for k in range(self.count))
+
+    def varying_plant(self, group: int) -> tuple[str, ...]:
+        """Parameters of the well that differ within a group, so that a compiled program takes them per lane."""
+        members = self.groups[group].scenarios
+        return tuple(
+            name
+            for name, values in self._inputs.plant.items()
+            if len(values) > 1 and (values[members] != values[members[0]]).any()
+        )
+
+    @functools.cached_property
+    def hash(self) -> str:
+        """Of everything that the stored results depend on: all scenarios, their coordinates, and what is stored."""
+        columns = [(c.key, c.label, c.unit, c.values.tolist()) for c in self.columns]
+        store = self.definition.store
+        chunks = [(c.group, c.scenarios.tolist()) for c in self.chunks]
+        return fingerprint.content_hash(
+            list(self.scenario_hashes), columns, chunks, store.every, list(store.trajectories)
+        )
+
+    def lanes(self, group: int) -> int:
+        """Scenarios of the compiled program of a group, padding included."""
+        return min(self.chunk_size, len(self.groups[group].scenarios))
+
+    @property
+    def work(self) -> Work:
+        """The chunks and what they are expected to cost."""
+        return Work(
+            groups=[chunk.group for chunk in self.chunks],
+            kinds=[group.kind for group in self.groups],
+            seconds=[chunk_seconds(g.kind, g.samples, self.lanes(i)) for i, g in enumerate(self.groups)],
+        )
+
+    def describe(self) -> Description:
+        """What a run would do, for a dry run; prints as a short table."""
+        store = self.definition.store
+        widths = {"": 1, "cv": len(CV_NAMES), "mv": len(MV_NAMES)}
+        kept = sum(
+            widths[axis] for axis, names in AXES.items() for name in names if name in store.trajectories
+        )
+        points = math.ceil(max(group.samples for group in self.groups) / store.every)
+        return Description(
+            name=self.name,
+            scenarios=self.count,
+            group_sizes=tuple(len(group.scenarios) for group in self.groups),
+            chunks=len(self.chunks),
+            compilations=len(self.groups),
+            models=len(self.model_points),
+            samples=sum(len(group.scenarios) * group.samples for group in self.groups),
+            stored_bytes=self.count * (KEY_FIGURES + kept * points) * NUMBER_BYTES,
+            seconds=MODEL_SECONDS * len(self.model_points) + self.work.rest({}),
+        )
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        return html.study(self)
+
+    def _variant(self, k: int) -> Variant:
+        if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not 0 <= k < self.count:
+            raise InputError("scenario", k, f"a number from 0 to {self.count - 1}")
+        return self._inputs.variants[self._inputs.variant[k]]
+
+    def _disturbance(self, k: int) -> np.ndarray | None:
+        """Offsets "sample" [bar]; a step counts from the first sample that starts at its time or later."""
+        steps, variant = row(self._inputs.pressure, k), self._variant(k)
+        if not steps[:, 1].any():
+            return None
+        now = np.arange(variant.samples) * variant.structure.dt
+        place = np.searchsorted(steps[:, 0], now + 1e-9 * variant.structure.dt, side="right")
+        return np.concatenate([[0.0], steps[:, 1]])[place]
+
+    def _faults(self, k: int) -> np.ndarray | None:
+        """Errors of the sensors "sample cv" [CV unit]."""
+        inputs, variant = self._inputs, self._variant(k)
+        if not inputs.fault_kinds:
+            return None
+        numbers = row(inputs.faults, k).tolist()
+        faults = [SensorFault(*kind, *its) for kind, its in zip(inputs.fault_kinds, numbers, strict=True)]  # type: ignore[arg-type]
+        return fault_errors(variant.structure, variant.samples, faults, path="base.sensor_fault")
+
+    @functools.cached_property
+    def _code(self) -> str:
+        return code_hash()
+
+    @functools.cached_property
+    def _variant_hashes(self) -> list[str]:
+        return [
+            fingerprint.content_hash(
+                v.kind,
+                v.actuator,
+                dataclasses.asdict(v.structure),
+                np.asarray(v.reference.times),
+                np.asarray(v.reference.setpoints),
+                v.samples,
+            )
+            for v in self._inputs.variants
+        ]
+
+
+def code_hash() -> str:
+    """Of the code that turns the numbers of a scenario into results."""
+    packages = [fingerprint.source_hash(package) for package in ("jaxmpc", "identify")]
+    modules = [fingerprint.module_hash(f"studies.{name}") for name in COMPUTING]
+    return fingerprint.content_hash(packages, modules, models.STEPS, models.SAMPLES)
+
+
+def expand(definition: StudyDefinition, *, confirmed: bool = False) -> Study:
+    """Expand a definition; see `StudyDefinition.expand`.
+
+    What is guaranteed: every scenario has a structure, tuning, well, working point, reference and disturbance that the typed
+    objects accept, also in combination. What only a simulation shows, such as a well that does not settle, is not.
+    """
+    table = expand_axes(definition, confirmed=confirmed)
+    inputs = resolve(definition, table)
+    groups = _groups(inputs, len(table))
+    given = definition.study.chunk_size
+    wanted = default_chunk_size(len(table)) if isinstance(given, UnsetType) else given
+    size = min(wanted, max(len(group.scenarios) for group in groups))
+    chunks: list[Chunk] = []
+    for g, group in enumerate(groups):
+        for begin in range(0, len(group.scenarios), size):
+            chunks.append(Chunk(len(chunks), g, group.scenarios[begin : begin + size]))
+    study = Study(definition, len(table), _columns(table), groups, tuple(chunks), size, inputs)
+    for group in groups:  # the typed objects agree with the checks of whole columns
+        study.scenario(int(group.scenarios[0]))
+    return study
+
+
+def default_chunk_size(scenarios: int) -> int:
+    """Scenarios of a chunk where the definition does not say: a power of two that makes `CHUNKS` chunks or more, at most 64.
+
+    So several workers have something to do, and a run that is killed loses little. It follows from the study and not from
+    the workers, who may change from one start to the next; as a power of two it stays when a study grows a little, and with
+    it the chunks and the compiled programs.
+    """
+    return 2 ** min(max(scenarios // CHUNKS, 1).bit_length() - 1, 6)
+
+
+def load_study(name_or_path: str | Path, *, quick: bool = False, confirmed: bool = False) -> Any:
+    """Read a definition (`definition.load_definition`) and expand it.
+
+    Args:
+        name_or_path: a shipped study or a file.
+        quick: the quick version.
+        confirmed: accept more scenarios than ``study.confirmation_limit``.
+
+    Returns:
+        `Study`, or a `search_study.SearchStudy` where the definition has ``[search]``.
+
+    Raises:
+        InputError: naming the path of the field, before anything is computed.
+    """
+    return load_definition(name_or_path).expand(quick=quick, confirmed=confirmed)
+
+
+def _columns(table: AxisTable) -> tuple[Column, ...]:
+    out = []
+    for a, axis in enumerate(table.axes):
+        for field, label, values in zip(axis.fields, axis.labels, axis.values, strict=True):
+            out.append(Column(field.key, label, field.unit, field.column(values)[table.index[:, a]]))
+    return tuple(out)
+
+
+def _groups(inputs: Inputs, count: int) -> tuple[Group, ...]:
+    tuning = inputs.tuning
+    limited = np.any(np.isfinite(tuning["cv_low"]) | np.isfinite(tuning["cv_high"]), axis=1)
+    reach = np.maximum(-tuning["move_low"][:, 0], tuning["move_high"][:, 0])  # of the choke [%]
+    switching = np.any(np.isfinite(tuning["bad_limit"]), axis=1)
+    members: dict[tuple[Any, Any, Any, int, bool, int, bool], list[int]] = {}
+    for k in range(count):
+        variant = inputs.variants[inputs.variant[k]]
+        step = variant.structure.integer_step[0]
+        farthest = float(min(row(reach, k), row(tuning["mv_high"], k)[0] - row(tuning["mv_low"], k)[0], 1e6))
+        steps = int(farthest / step + 1e-9) if step else 0
+        key = (
+            variant.kind,
+            variant.actuator,
+            variant.structure,
+            variant.samples,
+            bool(row(limited, k)),
+            steps,
+            bool(row(switching, k)),
+        )
+        members.setdefault(key, []).append(k)
+    groups = []
+    for key, scenarios in members.items():
+        points = dict.fromkeys(tuple(row(inputs.point, k).tolist()) for k in scenarios)
+        groups.append(Group(*key, tuple(points), np.array(scenarios)))
+    return tuple(groups)

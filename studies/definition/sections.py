@@ -1,0 +1,175 @@
+"""The tables of a study definition as strict msgspec types, one per TOML table; `studies.definition.sweep` decodes them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import UNSET, UnsetType
+
+from jaxmpc.controller.measurement import FAULTS
+from jaxmpc.errors import InputError
+from jaxmpc.loop.reference import Reference
+from jaxmpc.loop.trajectory import AXES
+from jaxmpc.process.well.equations import CV_NAMES
+
+Count = Annotated[int, msgspec.Meta(ge=1)]
+STORABLE = tuple(name for names in AXES.values() for name in names if name != "time")
+
+
+class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename=lambda n: n.rstrip("_")):
+    """A table of the file; a trailing underscore avoids a Python keyword."""
+
+
+class StudySection(Section, frozen=True):
+    """``[study]``.
+
+    Attributes:
+        name: of the study and of its folder of results.
+        title: for reports.
+        chunk_size: scenarios that are computed and stored together; if not given, `scenarios.default_chunk_size` of a
+            study, `search_study.BATCH` of a search.
+        confirmation_limit: scenarios beyond which a run must be confirmed.
+    """
+
+    name: str
+    title: str = ""
+    chunk_size: Count | UnsetType = UNSET
+    confirmation_limit: Count = 10_000
+
+
+class Range(Section, frozen=True):
+    """Evenly spaced values, ends included; ``log`` spaces their logarithms evenly."""
+
+    from_: float
+    to: float
+    count: Count
+    scale: Literal["linear", "log"] = "linear"
+
+
+class Distribution(Section, frozen=True):
+    """What a sampled axis is drawn from: uniform or log-uniform `from`..`to`, or normal with `mean` and `deviation`."""
+
+    kind: Literal["uniform", "log-uniform", "normal"]
+    from_: float | UnsetType = UNSET
+    to: float | UnsetType = UNSET
+    mean: float | UnsetType = UNSET
+    deviation: float | UnsetType = UNSET
+
+
+class CsvSource(Section, frozen=True):
+    """Columns of a CSV file, relative to the definition; a column has the name of its key if not given."""
+
+    file: str
+    column: str | UnsetType = UNSET
+    columns: list[str] | UnsetType = UNSET
+
+
+class Axis(Section, frozen=True):
+    """``[[axes]]``: one key, or several that move together, and where its entries come from."""
+
+    key: str | UnsetType = UNSET
+    keys: list[str] | UnsetType = UNSET
+    values: list[Any] | UnsetType = UNSET
+    range: Range | UnsetType = UNSET
+    distribution: Distribution | UnsetType = UNSET
+    csv: CsvSource | UnsetType = UNSET
+    keep: list[int] | UnsetType = UNSET
+    unit: str | list[str] | UnsetType = UNSET
+    label: str | list[str] | UnsetType = UNSET
+
+
+class Sampling(Section, frozen=True):
+    """``[sampling]``: how entries of the axes combine into scenarios."""
+
+    method: Literal["grid", "zip", "latin-hypercube", "sobol", "list"] = "grid"
+    count: Count | UnsetType = UNSET
+    seed: Annotated[int, msgspec.Meta(ge=0)] = 0
+    file: str | UnsetType = UNSET
+
+
+class Search(Section, frozen=True):
+    """``[search]``: the axes are searched, batch by batch, instead of listed.
+
+    Attributes:
+        objectives: key figures of `studies.kpi.objectives`, one or more.
+        batches: how many chunks are asked for, each after the results of the one before.
+        directions: one per objective; all are minimized if not given.
+        sampler: what asks.
+        seed: of the sampler.
+    """
+
+    objectives: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
+    batches: Count
+    directions: tuple[Literal["minimize", "maximize"], ...] | UnsetType = UNSET
+    sampler: Literal["nsga2", "tpe"] = "nsga2"
+    seed: Annotated[int, msgspec.Meta(ge=0)] = 0
+
+
+class Store(Section, frozen=True):
+    """``[store]``.
+
+    Attributes:
+        every: samples from one stored point of a trajectory to the next.
+        trajectories: which fields of `jaxmpc.loop.trajectory.Trajectory` to keep over time.
+    """
+
+    every: Count = 10
+    trajectories: tuple[Literal[STORABLE], ...] = ("cv", "mv", "setpoint")  # type: ignore[valid-type]
+
+
+class Cut(Section, frozen=True):
+    """An axis of the quick cut: other values, another count of the range, or only the entries at some positions."""
+
+    values: list[Any] | UnsetType = UNSET
+    count: Count | UnsetType = UNSET
+    keep: list[int] | UnsetType = UNSET
+
+
+class Quick(Section, frozen=True):
+    """``[quick]``: what ``--quick`` replaces."""
+
+    count: Count | UnsetType = UNSET
+    batches: Count | UnsetType = UNSET
+    chunk_size: Count | UnsetType = UNSET
+    base: dict[str, Any] = {}
+    axes: dict[str, Any] = {}
+
+
+class PressureStep(Section, frozen=True):
+    """``[[base.disturbance]]``: the reservoir pressure is off by `offset` [bar] from `time` [s] on."""
+
+    time: float
+    offset: float
+
+
+class FaultSection(Section, frozen=True):
+    """``[[base.sensor_fault]]``: a sensor that fails for a while, as in `jaxmpc.controller.measurement.SensorFault`."""
+
+    cv: Literal[CV_NAMES]  # type: ignore[valid-type]
+    kind: Literal[FAULTS]  # type: ignore[valid-type]
+    time: float
+    duration: float | UnsetType = UNSET
+    size: float = 0.0
+
+
+class InlineReference(Section, frozen=True):
+    """``[base.reference]``: setpoints of the study's own, as in `jaxmpc.loop.reference.Reference`."""
+
+    times: tuple[float, ...]
+    setpoints: tuple[tuple[float, ...], ...]
+    duration: float
+
+    def build(self) -> Reference:
+        """The reference, or an `InputError` with the path in the file."""
+        try:
+            reference = Reference(self.times, self.setpoints, self.duration)
+        except InputError as error:
+            raise InputError(f"base.{error.field}", error.value, error.expected, error.hint) from None
+        if reference.cv_count != len(CV_NAMES):
+            raise InputError(
+                "base.reference.setpoints",
+                f"{reference.cv_count} columns",
+                f"one per CV: {', '.join(CV_NAMES)} [m3/h]",
+            )
+        return reference

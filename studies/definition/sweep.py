@@ -1,0 +1,388 @@
+"""What a sweep study is, as typed data read from TOML: strict, with the full path of whatever is wrong.
+
+`load_definition` reads a shipped name or a file, `StudyDefinition.from_dict` the same content as a Python dictionary;
+`studies.definition.scenarios.load_study` also expands it. `docs/studies.md` explains every key.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+from msgspec import UNSET
+
+from jaxmpc.controller.measurement import FAULTS
+from jaxmpc.errors import InputError
+from jaxmpc.process.well.equations import CV_NAMES
+from studies.definition.fields import FIELDS, near, similar_end
+from studies.definition.sections import (
+    STORABLE,
+    Axis,
+    CsvSource,
+    Cut,
+    Distribution,
+    FaultSection,
+    InlineReference,
+    PressureStep,
+    Quick,
+    Range,
+    Sampling,
+    Search,
+    Section,
+    Store,
+    StudySection,
+)
+
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class StudyDefinition:
+    """A sweep study as written, every section decoded.
+
+    Attributes:
+        study, axes, sampling, store, quick: the sections of the file.
+        search: what is sought along the axes; None for a study that lists its scenarios.
+        base: settings by key (`fields.FIELDS`), only those that are given; besides, ``reference`` may be an
+            `InlineReference`, ``disturbance`` is a tuple of `PressureStep` and ``sensor_fault`` one of `FaultSection`.
+        places: path of every axis in the file, for errors.
+        folder: that CSV files are relative to.
+        body: content of the file, from which `from_dict` makes the same definition again.
+        is_cut: whether this is the quick version of it.
+    """
+
+    study: StudySection
+    base: dict[str, Any]
+    axes: tuple[Axis, ...]
+    sampling: Sampling
+    store: Store
+    quick: Quick | None
+    places: tuple[str, ...]
+    folder: str = "."
+    body: dict[str, Any] = dataclasses.field(default_factory=dict)
+    is_cut: bool = False
+    search: Search | None = None
+
+    @classmethod
+    def from_dict(cls, body: dict[str, Any], folder: str | Path = ".") -> StudyDefinition:
+        """Decode the content of a definition file.
+
+        Args:
+            body: nested dictionaries and lists, as TOML decodes them.
+            folder: that CSV files are relative to.
+
+        Raises:
+            InputError: naming the path of the field, for unknown or missing keys and wrong types.
+        """
+        sections = ("study", "base", "axes", "sampling", "search", "store", "quick")
+        if not isinstance(body, dict):
+            raise InputError("study definition", body, f"tables {', '.join(sections)}")
+        _check_plain(body)
+        for name in body:
+            if name not in sections:
+                raise InputError(
+                    str(name), body[name], f"a table {', '.join(sections)}", near(name, sections)
+                )
+        axes = body.get("axes", [])
+        if not isinstance(axes, list):
+            raise InputError("axes", axes, "a list of tables, each headed [[axes]]")
+        study = _convert(body.get("study", {}), StudySection, "study")
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", study.name):
+            expected = "up to 100 letters, digits, '-', '_' and '.': it names the folder of the results"
+            raise InputError("study.name", study.name, expected)
+        quick = _convert(body["quick"], Quick, "quick") if "quick" in body else None
+        search = _convert(body["search"], Search, "search") if "search" in body else None
+        if search is not None and "sampling" in body:
+            raise InputError("sampling", body["sampling"], "no such table: [search] draws from the axes")
+        out = cls(
+            study=study,
+            base=settings(body.get("base", {}), "base"),
+            axes=tuple(_convert(axis, Axis, f"axes[{i}]") for i, axis in enumerate(axes)),
+            sampling=_convert(body.get("sampling", {}), Sampling, "sampling"),
+            store=_convert(body.get("store", {}), Store, "store"),
+            quick=quick,
+            places=tuple(f"axes[{i}]" for i in range(len(axes))),
+            folder=str(folder),
+            body=body,
+            search=search,
+        )
+        for i, name in enumerate(out.store.trajectories):
+            if name in out.store.trajectories[:i]:
+                raise InputError(f"store.trajectories[{i}]", name, "each trajectory once")
+        if quick is not None:
+            out.cut()  # so that a mistake in it is found by every run
+        return out
+
+    def cut(self) -> StudyDefinition:
+        """The quick version: what ``[quick]`` says replaces the rest, and the name ends in ``-quick``.
+
+        Raises:
+            InputError: if there is no ``[quick]`` or it does not fit the axes.
+        """
+        quick = self.quick
+        if quick is None:
+            raise InputError("quick", "nothing", "a table [quick]: this study has no quick version")
+        firsts = [axis.key if axis.keys is UNSET else (axis.keys or [UNSET])[0] for axis in self.axes]
+        axes, places = list(self.axes), list(self.places)
+        for key, body in quick.axes.items():
+            place = f'quick.axes."{key}"'
+            if key not in firsts:
+                known = [str(first) for first in firsts]
+                raise InputError(
+                    place, body, f"the (first) key of an axis: {', '.join(known)}", near(key, known)
+                )
+            i, change = firsts.index(key), _convert(body, Cut, place)
+            given = [name for name in ("values", "count", "keep") if getattr(change, name) is not UNSET]
+            if len(given) != 1:
+                raise InputError(place, given or "nothing", "exactly one of values, count and keep")
+            if given == ["values"]:
+                sources = dict.fromkeys(("range", "distribution", "csv", "keep"), UNSET)
+                axes[i] = msgspec.structs.replace(axes[i], values=change.values, **sources)
+            elif given == ["keep"]:
+                axes[i] = msgspec.structs.replace(axes[i], keep=change.keep)
+            else:
+                whole = axes[i].range
+                if not isinstance(whole, Range):
+                    raise InputError(f"{place}.count", change.count, "values or keep: this axis has no range")
+                axes[i] = msgspec.structs.replace(
+                    axes[i], range=msgspec.structs.replace(whole, count=change.count)
+                )
+            places[i] = place if given == ["values"] else places[i]
+        sampling, study, search = self.sampling, self.study, self.search
+        if quick.count is not UNSET:
+            if sampling.count is UNSET:
+                raise InputError("quick.count", quick.count, "nothing: [sampling] has no count either")
+            sampling = msgspec.structs.replace(sampling, count=quick.count)
+        if quick.batches is not UNSET:
+            if search is None:
+                raise InputError("quick.batches", quick.batches, "nothing: there is no [search]")
+            search = msgspec.structs.replace(search, batches=quick.batches)
+        if quick.chunk_size is not UNSET:
+            study = msgspec.structs.replace(study, chunk_size=quick.chunk_size)
+        return dataclasses.replace(
+            self,
+            study=msgspec.structs.replace(study, name=f"{study.name}-quick"),
+            base={**self.base, **settings(quick.base, "quick.base")},
+            axes=tuple(axes),
+            places=tuple(places),
+            sampling=sampling,
+            quick=None,
+            is_cut=True,
+            search=search,
+        )
+
+    def expand(self, *, quick: bool = False, confirmed: bool = False) -> Any:
+        """All scenarios, checked: a `studies.definition.scenarios.Study`; nothing is simulated.
+
+        A definition with ``[search]`` becomes a `studies.search.study.SearchStudy`.
+
+        Args:
+            quick: the quick version.
+            confirmed: accept more scenarios than ``study.confirmation_limit``.
+
+        Raises:
+            InputError: naming the path of the field.
+        """
+        if self.search is not None:
+            from studies.search.study import expand_search as expand
+        else:
+            from studies.definition.scenarios import expand
+
+        return expand(self.cut() if quick else self, confirmed=confirmed)
+
+
+def load_definition(name_or_path: str | Path) -> StudyDefinition:
+    """Read a shipped definition by name (see `shipped_studies`), or any file by its path.
+
+    Raises:
+        InputError: for an unknown name, a file that cannot be read, text that is not TOML, and what `from_dict` refuses.
+    """
+    shipped = shipped_studies()
+    path = shipped.get(str(name_or_path)) or Path(name_or_path)
+    try:
+        body = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        expected = f"a definition file, or one of {', '.join(shipped)} ({error.strerror or error})"
+        raise InputError("study", str(name_or_path), expected, near(name_or_path, shipped)) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError("study", str(path), f"a TOML file ({error})") from None
+    return StudyDefinition.from_dict(body, path.parent)
+
+
+def shipped_studies() -> dict[str, Path]:
+    """Definitions that come with the package, by name."""
+    folder = Path(str(resources.files("studies")))
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+# ------------------------------------------------------------------------------------------------------- decoding
+
+DEEPEST = 16  # tables and lists within each other; no key needs more than five
+LARGEST_WHOLE = 2**63 - 1  # as TOML has them
+
+
+def _check_plain(body: dict[str, Any]) -> None:
+    """Refuse what no TOML file holds, or no study needs, before anything looks closer: it could not even be printed."""
+    level: list[tuple[str, Any]] = [("", body)]
+    for _ in range(DEEPEST):
+        inner: list[tuple[str, Any]] = []
+        for path, value in level:
+            if isinstance(value, dict):
+                for key in value:
+                    if not isinstance(key, str) or not key.isprintable():
+                        raise InputError(path or "study definition", key, "keys of printable text")
+                inner += [(f"{path}.{key}".lstrip("."), entry) for key, entry in value.items()]
+            elif isinstance(value, (list, tuple)):
+                inner += [(f"{path}[{i}]", entry) for i, entry in enumerate(value)]
+            elif isinstance(value, str):
+                try:
+                    value.encode()
+                except UnicodeEncodeError:
+                    raise InputError(path, value, "text of whole Unicode characters") from None
+            elif isinstance(value, int) and abs(value) > LARGEST_WHOLE:
+                raise InputError(path, f"{value.bit_length()} bits", "a whole number of at most 63 bits")
+        level = inner
+    if level:
+        raise InputError(level[0][0], "tables or lists", f"no more than {DEEPEST} of them within each other")
+
+
+def settings(body: Any, path: str) -> dict[str, Any]:
+    """A base table as settings by key, each of its own type; `InputError` with the full path otherwise."""
+    if not isinstance(body, dict):
+        raise InputError(path, body, "a table of settings")
+    out: dict[str, Any] = {}
+
+    def walk(table: dict[str, Any], prefix: str) -> None:
+        for name, value in table.items():
+            key = f"{prefix}{name}"
+            where = f"{path}.{key}"
+            below = [known for known in FIELDS if known.startswith(key + ".")]
+            if key == "disturbance":
+                out[key] = _disturbance(value, where)
+            elif key == "sensor_fault":
+                out[key] = _sensor_faults(value, where)
+            elif key == "reference" and isinstance(value, dict):
+                out[key] = _convert(value, InlineReference, where)
+                out[key].build()
+            elif key in FIELDS:
+                out[key] = FIELDS[key].check(where, value)
+            elif below and isinstance(value, dict):
+                walk(value, key + ".")
+            elif below:
+                names = dict.fromkeys(known[len(key) + 1 :].partition(".")[0] for known in below)
+                raise InputError(where, value, f"a table with {', '.join(names)}")
+            else:
+                if isinstance(value, dict) and value:  # name the whole key that was meant
+                    inner = next(iter(value))
+                    key, value, where = f"{key}.{inner}", value[inner], f"{where}.{inner}"
+                raise InputError(
+                    where, value, "a key of docs/studies.md", near(key, FIELDS) or similar_end(key)
+                )
+
+    walk(body, "")
+    return out
+
+
+def _disturbance(value: Any, where: str) -> tuple[PressureStep, ...]:
+    if not isinstance(value, list):
+        raise InputError(where, value, f"steps of the reservoir pressure, each headed [[{where}]]")
+    steps = tuple(_convert(step, PressureStep, f"{where}[{i}]") for i, step in enumerate(value))
+    for i, step in enumerate(steps):
+        earliest = steps[i - 1].time if i else -math.inf
+        if not (math.isfinite(step.time) and step.time >= 0 and step.time > earliest):
+            expected = f"a time after the step before it, {earliest:g} s" if i else "a time of 0 s or more"
+            raise InputError(f"{where}[{i}].time", step.time, expected)
+        if not math.isfinite(step.offset):
+            raise InputError(
+                f"{where}[{i}].offset", step.offset, "a finite change of the reservoir pressure [bar]"
+            )
+    return steps
+
+
+def _sensor_faults(value: Any, where: str) -> tuple[FaultSection, ...]:
+    if not isinstance(value, list):
+        raise InputError(where, value, f"faults of sensors, each headed [[{where}]]")
+    faults = tuple(_convert(fault, FaultSection, f"{where}[{i}]") for i, fault in enumerate(value))
+    for i, fault in enumerate(faults):
+        for name in ("time", "duration", "size"):
+            if (given := getattr(fault, name)) is not UNSET:
+                FIELDS[f"sensor_fault.{name}"].check(f"{where}[{i}].{name}", given)
+    return faults
+
+
+_NESTED: dict[str, type[Section]] = {"range": Range, "distribution": Distribution, "csv": CsvSource}
+_EXPECTED = {
+    "study.name": "text in quotes, the name of the study",
+    "chunk_size": "a whole number of 1 or more [scenarios]",
+    "confirmation_limit": "a whole number of 1 or more [scenarios]",
+    "count": "a whole number of 1 or more [scenarios or values]",
+    "sampling.seed": "a whole number of 0 or more",
+    "batches": "a whole number of 1 or more [batches]",
+    "search.objectives": "a list of key figures, one or more, such as choke_travel or deviation",
+    "search.directions": "a list of 'minimize' and 'maximize', one per objective",
+    "search.sampler": "one of nsga2, tpe",
+    "search.seed": "a whole number of 0 or more",
+    "every": "a whole number of 1 or more [samples]",
+    "trajectories": f"a list of some of {', '.join(STORABLE)}",
+    "sampling.method": "one of grid, zip, latin-hypercube, sobol, list",
+    "scale": "'linear' or 'log'",
+    "kind": "one of uniform, log-uniform, normal",
+    "keep": "a list of positions, the first is 0",
+    "values": "a list of values",
+    "sensor_fault.cv": f"one of {', '.join(CV_NAMES)}",
+    "sensor_fault.kind": f"one of {', '.join(FAULTS)}",
+    "time": "a time [s]",
+    "offset": "a change of the reservoir pressure [bar]",
+    "times": "a list of times [s]",
+    "setpoints": f"a list of rows, one number per CV ({', '.join(CV_NAMES)}) [m3/h]",
+    "duration": "a length of the run [s]",
+}
+_KIND = {
+    "float": "a finite number",
+    "int": "a whole number",
+    "str": "text in quotes",
+    "object": "a table",
+    "array": "a list",
+}
+
+
+def _convert(body: Any, section: type[T], path: str) -> T:
+    """The decoded section, or an InputError with the path that msgspec found, below `path`."""
+    try:
+        return msgspec.convert(body, section)
+    except msgspec.ValidationError as error:
+        message, _, where = str(error).partition(" - at `$")
+        inner = where.rstrip("`").lstrip(".")
+        value, struct, full = body, section, path
+        for name, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", inner):
+            value = value[name] if name else value[int(index)]
+            struct = _NESTED.get(name, struct)
+            full += f".{name}" if name else f"[{index}]"
+        if found := re.search(r"unknown field `(.*)`", message):
+            known = msgspec.structs.fields(struct)  # type: ignore[arg-type]
+            names = [field.encode_name for field in known]
+            raise InputError(
+                f"{full}.{found[1]}",
+                value[found[1]],
+                f"one of the keys {', '.join(names)}",
+                near(found[1], names),
+            ) from None
+        if found := re.search(r"missing required field `(.*)`", message):
+            raise InputError(
+                f"{full}.{found[1]}", None, f"{_expected(f'{full}.{found[1]}')}; it is missing"
+            ) from None
+        found = re.match(r"Expected `(\w+)", message)
+        fallback = _KIND.get(found[1], message[0].lower() + message[1:]) if found else message
+        raise InputError(full, value, _expected(full) or fallback) from None
+
+
+def _expected(path: str) -> str:
+    plain = re.sub(r"\[\d+\]", "", path)
+    ends = [".".join(plain.split(".")[-parts:]) for parts in (2, 1)]
+    return next((_EXPECTED[end] for end in (plain, *ends) if end in _EXPECTED), "")

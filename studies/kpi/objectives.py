@@ -1,0 +1,160 @@
+"""What a search weighs: objectives by name, their values per scenario, and which scenarios none beats.
+
+An objective is a key figure of `studies.kpi.sweep`, with the name of a channel behind it where it has one
+(``mean_absolute_deviation.oil_rate``), or ``deviation``: the mean over the CVs of the mean absolute deviation, each
+divided by its deadzone in the thesis. The front is never stored: `front` computes it from the stored key figures, so that
+it always agrees with them, also in a store that is not complete yet.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from msgspec import UNSET
+
+from jaxmpc.errors import InputError
+from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES
+from studies.definition import presets
+from studies.definition.fields import near
+from studies.definition.sections import Search
+from studies.kpi.sweep import KPIS
+from studies.store.comparison import provenance
+from studies.store.layout import FLAG
+from studies.store.reading import open_study
+
+DEVIATION = "deviation"
+CHANNELS = {(): (), ("cv",): CV_NAMES, ("mv",): MV_NAMES}
+FIGURES = {kpi.name: kpi for kpi in KPIS}
+CLOCK = "solve_time"  # figures of the clock differ from run to run
+THESIS_DEADZONE = tuple(presets.tuning_fields("thesis")["deadzone"][name] for name in CV_NAMES)
+DIRECTIONS = ("minimize", "maximize")
+
+
+@dataclasses.dataclass(frozen=True)
+class Objective:
+    """One objective.
+
+    Attributes:
+        name: as in the definition.
+        direction: ``minimize`` or ``maximize``.
+        figure: key figure that it is made of.
+        channel: position of its CV or MV; None where the figure has no channels, and for the combined deviation.
+    """
+
+    name: str
+    direction: str
+    figure: str
+    channel: int | None = None
+
+    def values(self, fields: Mapping[str, Any]) -> np.ndarray:
+        """Per scenario, from the stored variables ``"scenario ..."`` by name; NaN for a run that is not complete."""
+        figure = np.asarray(fields[self.figure], dtype=float)
+        if self.name == DEVIATION:
+            figure = (figure / THESIS_DEADZONE).mean(axis=1)
+        elif self.channel is not None:
+            figure = figure[:, self.channel]
+        return np.where(np.asarray(fields[FLAG]) > 0, figure, np.nan)
+
+
+def objective(path: str, name: str, direction: str = "minimize") -> Objective:
+    """The objective of a name.
+
+    Args:
+        path: where the name stands, for errors.
+        name: of the objective.
+        direction: ``minimize`` or ``maximize``.
+
+    Raises:
+        InputError: for an unknown name, a figure with channels without one, and figures of the clock.
+    """
+    if name == DEVIATION:
+        return Objective(name, direction, "mean_absolute_deviation")
+    figure, _, channel = name.partition(".")
+    if figure not in FIGURES:
+        known = [DEVIATION, *FIGURES]
+        raise InputError(path, name, "a key figure of docs/kpis.md, or deviation", near(figure, known))
+    if figure.startswith(CLOCK):
+        advice = "It depends on the machine and would make the search another one every time"
+        raise InputError(path, name, "a key figure that does not depend on the clock", advice)
+    names = CHANNELS[FIGURES[figure].dims]
+    if not names:
+        if channel:
+            raise InputError(path, name, f"{figure} alone: it has no channels")
+        return Objective(name, direction, figure)
+    if channel not in names:
+        expected = " or ".join(f"{figure}.{known}" for known in names)
+        raise InputError(path, name, expected, near(channel, names))
+    return Objective(name, direction, figure, names.index(channel))
+
+
+def objectives_of(search: Search) -> tuple[Objective, ...]:
+    """The objectives of a definition, checked.
+
+    Raises:
+        InputError: naming the path in the definition.
+    """
+    names = search.objectives
+    directions = (DIRECTIONS[0],) * len(names) if search.directions is UNSET else search.directions
+    if len(directions) != len(names):
+        expected = f"{len(names)} directions, one per objective"
+        raise InputError("search.directions", list(directions), expected)
+    out = []
+    for i, (name, direction) in enumerate(zip(names, directions, strict=True)):
+        if name in names[:i]:
+            raise InputError(f"search.objectives[{i}]", name, "each objective once")
+        out.append(objective(f"search.objectives[{i}]", name, direction))
+    return tuple(out)
+
+
+def values_of(objectives: Sequence[Objective], fields: Mapping[str, Any]) -> np.ndarray:
+    """Objectives ``"scenario objective"`` from stored variables by name; NaN for a run that is not complete."""
+    return np.stack([o.values(fields) for o in objectives], axis=1)
+
+
+def costs(objectives: Sequence[Objective], values: np.ndarray) -> np.ndarray:
+    """Objectives ``"scenario objective"`` with signs that make smaller better."""
+    return values * [1.0 if o.direction == DIRECTIONS[0] else -1.0 for o in objectives]
+
+
+def unbeaten(values: np.ndarray) -> np.ndarray:
+    """Which points no other point beats: as good in everything and better in something, smaller being better.
+
+    Equal points do not beat each other; points with a value that is not finite are never among them and beat nothing.
+
+    Args:
+        values: ``"point objective"``.
+    """
+    finite = np.all(np.isfinite(values), axis=1)
+    out, rivals = finite.copy(), values[finite]
+    for i in np.flatnonzero(finite):
+        as_good, better = (rivals <= values[i]).all(axis=1), (rivals < values[i]).any(axis=1)
+        out[i] = not (as_good & better).any()
+    return out
+
+
+def front(store: str | Path) -> np.ndarray:
+    """Numbers of the stored scenarios that no other beats, the best in the first objective first.
+
+    Args:
+        store: of a search, complete or not.
+
+    Raises:
+        InputError: if there is no store, or it is not that of a search.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Damaged in")  # such scenarios read as not complete
+        data = open_study(store)
+    with data:
+        names = provenance(data, "objectives")
+        if not isinstance(names, dict):
+            raise InputError("store", str(store), "the store of a search, which has objectives")
+        objectives = [objective("objectives", name, direction) for name, direction in names.items()]
+        values = costs(objectives, values_of(objectives, data.data_vars))  # type: ignore[arg-type]
+        best = np.flatnonzero(unbeaten(values))
+        order = np.lexsort(values[best].T[::-1])
+        return data.scenario.values[best[order]]

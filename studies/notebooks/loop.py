@@ -1,0 +1,350 @@
+"""One closed loop on the JAX well from a handful of settings, with key figures and every plan: what the app computes.
+
+Only numbers change from one run to the next as long as controller, blocking and length stay the same, so that nothing
+is compiled again. `main` prints the key figures of a run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import json
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.errors import InputError
+from jaxmpc.loop.reference import Reference
+from jaxmpc.loop.simulate import simulate
+from jaxmpc.loop.trajectory import RECORDABLE, Trajectory, TrajectoryBatch
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import Tuning
+from jaxmpc.process.plant import WellPlant
+from studies.definition import presets, references
+from studies.definition.models import identify_models
+from studies.definition.presets import CHOKE, GAS, OIL
+from studies.kpi.sweep import KPIS, RECORD, batch_kpis
+from studies.thesis.plans import StoredPlan, plan_at
+
+Progress = Callable[[int, int], None]
+
+RUN = "run"  # name of the one controller in `ExploreRun.data`
+CONTROLLERS = {  # kind of the controller and of the choke
+    "continuous": ("continuous", "continuous"),
+    "rounded": ("continuous", "step"),
+    "mixed-integer": ("mixed-integer", "step"),
+}
+BLOCKING = ("moves", "inputs", "none")
+START = references.THESIS_WINDOWS[0][1:]  # gas and oil setpoint at the working point [m3/h]
+STEP_TIME = 300.0  # s, when the setpoints of a short run change
+SHORT = 1800.0  # s, length of a short run
+
+# The key figures that are shown, with the words for them; the part behind the dot is a CV.
+SHOWN = {
+    "choke_travel": "choke travel",
+    "choke_moves": "choke moves",
+    "choke_reversals": "choke reversals",
+    "lift_travel": "lift travel",
+    f"mean_absolute_deviation.{OIL}": "mean deviation, oil",
+    f"mean_absolute_deviation.{GAS}": "mean deviation, gas",
+    f"time_outside_deadzone.{OIL}": "outside deadzone, oil",
+    f"time_outside_deadzone.{GAS}": "outside deadzone, gas",
+    "oil_produced": "oil produced",
+    "closed_loop_cost": "cost per sample",
+    "solve_time_median": "solve time, median",
+    "solve_time_max": "solve time, longest",
+    "largest_gap": "largest gap",
+    "not_optimal": "not optimal",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What a run is made of; None takes the value of the preset.
+
+    Attributes:
+        controller: a key of `CONTROLLERS`; ``rounded`` is continuous MPC on the step choke.
+        preset: a key of `studies.definition.presets.TUNINGS`.
+        soft: False turns Soft MPC off: the weight of the deviation becomes Q + S, as in a sweep.
+        blocking: one of `BLOCKING`.
+        choke_weight: move weight of the choke [1/%^2].
+        gas_weight: weight of the deviation of the gas rate [1/(m3/h)^2].
+        oil_weight: weight of the deviation of the oil rate [1/(m3/h)^2].
+        gas_deadzone: of Soft MPC [m3/h].
+        oil_deadzone: of Soft MPC [m3/h].
+        model_choke: choke at the working point of the model [%].
+        model_lift: gas lift there [m3/h].
+        gas_setpoint: of a short run, from `STEP_TIME` on [m3/h].
+        oil_setpoint: of a short run, from `STEP_TIME` on [m3/h].
+        pressure: change of the reservoir pressure, the disturbance [bar].
+        pressure_time: from when on [s].
+        whole: the whole reference of the thesis (22 h) instead of a short run.
+    """
+
+    controller: str = "mixed-integer"
+    preset: str = "thesis"
+    soft: bool = True
+    blocking: str = "moves"
+    choke_weight: float | None = None
+    gas_weight: float | None = None
+    oil_weight: float | None = None
+    gas_deadzone: float | None = None
+    oil_deadzone: float | None = None
+    model_choke: float = 50.0
+    model_lift: float = 7500.0
+    gas_setpoint: float = 9640.0
+    oil_setpoint: float = 152.0
+    pressure: float = 0.0
+    pressure_time: float = 900.0
+    whole: bool = False
+
+    def __post_init__(self):
+        for field, known in (("controller", tuple(CONTROLLERS)), ("preset", tuple(presets.TUNINGS))):
+            if getattr(self, field) not in known:
+                raise InputError(field, getattr(self, field), f"one of {', '.join(known)}")
+        if self.blocking not in BLOCKING:
+            raise InputError("blocking", self.blocking, f"one of {', '.join(BLOCKING)}")
+        if self.blocking == "none" and self.controller == "mixed-integer":
+            raise InputError(
+                "blocking",
+                "none",
+                "blocks for whole moves",
+                "Without blocks a step with whole moves takes seconds; choose moves or inputs, or another controller",
+            )
+        for field in ("pressure", "pressure_time"):
+            if not np.isfinite(getattr(self, field)):
+                raise InputError(field, getattr(self, field), f"a number [{FIELD_UNITS[field]}]")
+
+    @property
+    def structure(self) -> Structure:
+        """The checked structure."""
+        return presets.structure(self.blocking, integer=self.controller == "mixed-integer")  # type: ignore[arg-type]
+
+    @property
+    def tuning(self) -> Tuning:
+        """The checked tuning."""
+        fields = presets.tuning_fields(self.preset)
+        given = {
+            "cv_weight": {GAS: self.gas_weight, OIL: self.oil_weight},
+            "deadzone": {GAS: self.gas_deadzone, OIL: self.oil_deadzone},
+            "move_weight": {CHOKE: self.choke_weight},
+        }
+        for key, values in given.items():
+            fields[key] |= {name: value for name, value in values.items() if value is not None}
+        if not self.soft:
+            both = {name: fields["cv_weight"][name] + fields["soft_quadratic"][name] for name in (GAS, OIL)}
+            off = {GAS: 0.0, OIL: 0.0}
+            fields |= {"cv_weight": both, "soft_quadratic": off, "soft_linear": off}
+        return presets.tuning(self.structure, self.preset, fields)
+
+    @property
+    def reference(self) -> Reference:
+        """The thesis run, or a short run that changes the setpoints once."""
+        if self.whole:
+            return references.thesis()
+        return Reference([0.0, STEP_TIME], [START, (self.gas_setpoint, self.oil_setpoint)], SHORT)
+
+    @property
+    def offsets(self) -> np.ndarray:
+        """Change of the reservoir pressure, ``"sample"`` [bar]."""
+        dt = presets.SAMPLING_INTERVAL
+        return np.where(
+            np.arange(self.reference.samples(dt)) * dt >= self.pressure_time - 1e-9 * dt, self.pressure, 0.0
+        )
+
+
+FIELD_UNITS = {
+    "choke_weight": "1/%^2",
+    "gas_weight": "1/(m3/h)^2",
+    "oil_weight": "1/(m3/h)^2",
+    "gas_deadzone": "m3/h",
+    "oil_deadzone": "m3/h",
+    "model_choke": "%",
+    "model_lift": "m3/h",
+    "gas_setpoint": "m3/h",
+    "oil_setpoint": "m3/h",
+    "pressure": "bar",
+    "pressure_time": "s",
+}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ExploreRun:
+    """A finished run.
+
+    Attributes:
+        settings: that it was made with.
+        trajectory: every sample, with its plans.
+        kpis: every key figure of `studies.kpi.sweep` by name; ``name.channel`` where it is one per CV or MV.
+        model: prediction model of the controller.
+        tuning: of the controller.
+        structure: of the controller.
+        seconds: time that it took, key figures included [s].
+    """
+
+    settings: Settings
+    trajectory: Trajectory
+    kpis: dict[str, float]
+    model: StepResponseModel
+    tuning: Tuning
+    structure: Structure
+    seconds: float
+
+    @functools.cached_property
+    def data(self) -> xr.Dataset:
+        """The run as `studies.store.comparison.open_results` would give it, with one controller `RUN`."""
+        t, structure, settings = self.trajectory, self.structure, self.settings
+        kind, actuator = CONTROLLERS[settings.controller]
+        window = settings.reference.window(t.dt, t.samples)
+        variables: dict[str, Any] = {
+            "measurement": (("controller", "time", "cv"), t.cv[None]),
+            "demand": (("controller", "time", "mv"), t.mv_demand[None]),
+            "position": (("controller", "time", "mv"), t.mv[None]),
+            "move": (("controller", "time", "mv"), t.move[None]),
+            "bias": (("controller", "time", "cv"), t.bias[None]),
+            "plan": (("controller", "time", "block", "mv"), np.asarray(t.plan)[None]),
+            "setpoint": (("time", "cv"), t.setpoint),
+            "window": ("time", window),
+            "disturbance": ("time", settings.offsets[: t.samples]),
+            "model_coefficient": (("cv", "mv", "lag"), np.asarray(self.model.coefficients)),
+            "block_length": (("controller", "block"), np.array([structure.blocks])),
+            "prediction_horizon": ("controller", [structure.prediction_horizon]),
+            "complete": ("controller", [1]),
+        }
+        for name, value in {"kind": kind, "actuator": actuator, "blocking": structure.blocking}.items():
+            variables[name] = ("controller", [value])
+        for name in ("deadzone", "soft_quadratic", "soft_linear"):
+            variables[f"tuning_{name}"] = (("controller", "cv"), np.asarray(getattr(self.tuning, name))[None])
+        coords: dict[str, Any] = {"controller": [RUN], "time": t.time}
+        coords |= {"cv": list(t.cv_names), "mv": list(t.mv_names)}
+        coords |= {"cv_unit": ("cv", list(t.cv_units)), "mv_unit": ("mv", list(t.mv_units))}
+        definition = {"controllers": [{"name": RUN, "kind": kind, "actuator": actuator, "schedule": False}]}
+        return xr.Dataset(variables, coords, {"dt": t.dt, "definition": json.dumps(definition)})
+
+    def plan_at(self, sample: int) -> StoredPlan:
+        """The plan made at a sample, with the prediction that it was made on.
+
+        Raises:
+            InputError: for a sample outside the run.
+        """
+        if not 0 <= sample < self.trajectory.samples:
+            raise InputError("sample", sample, f"a sample of the run, 0 to {self.trajectory.samples - 1}")
+        return plan_at(self.data, RUN, float(self.trajectory.time[sample]))
+
+
+@functools.lru_cache(maxsize=64)
+def model_at(choke: float, lift: float) -> StepResponseModel:
+    """The model identified at a working point, choke [%] and gas lift [m3/h]; kept for the next run."""
+    (model,) = identify_models([(choke, lift)]).values()
+    return model
+
+
+def run(settings: Settings, progress: Progress | None = None) -> ExploreRun:
+    """Close the loop.
+
+    Args:
+        settings: of the run.
+        progress: called with ``(done, total)`` samples.
+
+    Raises:
+        InputError: naming the field, for settings that no controller or well can have; before anything runs.
+    """
+    begin = time.perf_counter()
+    structure, tuning, reference = settings.structure, settings.tuning, settings.reference
+    model = model_at(float(settings.model_choke), float(settings.model_lift))
+    kind, actuator = CONTROLLERS[settings.controller]
+    make = MixedIntegerController if kind == "mixed-integer" else ContinuousController
+    trajectory = simulate(
+        make(structure, tuning, model),
+        WellPlant(actuator=actuator),  # type: ignore[arg-type]
+        reference,
+        disturbance=settings.offsets,
+        keep_plans=True,
+        progress=progress,
+    )
+    figures = key_figures(trajectory, tuning, reference.window(trajectory.dt, trajectory.samples))
+    seconds = time.perf_counter() - begin
+    return ExploreRun(settings, trajectory, figures, model, tuning, structure, seconds)
+
+
+def key_figures(trajectory: Trajectory, tuning: Tuning, window: np.ndarray) -> dict[str, float]:
+    """Every key figure of a run by name, ``name.channel`` where it is one per CV or MV.
+
+    Args:
+        trajectory: of the well.
+        tuning: of its controller.
+        window: labels of the setpoint windows, ``"sample"``.
+    """
+    t = trajectory
+    batch = TrajectoryBatch(
+        lanes=np.zeros(1, dtype=int),
+        time=t.time,
+        setpoint=t.setpoint[None],
+        fields={name: np.asarray(getattr(t, name))[None] for name in RECORDABLE if name in RECORD},
+        cv_names=t.cv_names,
+        mv_names=t.mv_names,
+        cv_units=t.cv_units,
+        mv_units=t.mv_units,
+        dt=t.dt,
+    )
+    values = batch_kpis(batch, tuning, window)
+    out: dict[str, float] = {}
+    for item in KPIS:
+        names = {(): ("",), ("cv",): t.cv_names, ("mv",): t.mv_names}[item.dims]
+        for name, value in zip(names, np.atleast_1d(values[item.name][0]), strict=True):
+            out[f"{item.name}.{name}" if name else item.name] = float(value)
+    return out
+
+
+def shown_figures(run: ExploreRun) -> list[tuple[str, str, float]]:
+    """The key figures of `SHOWN`: words, unit, value."""
+    by_name = {item.name: item for item in KPIS}
+    return [
+        (words, by_name[key.partition(".")[0]].unit_of("m3/h"), run.kpis[key]) for key, words in SHOWN.items()
+    ]
+
+
+def written(value: float, unit: str) -> tuple[str, str]:
+    """A key figure and its unit as they are printed: times below a second in ms, others as they are."""
+    if unit == "s" and abs(value) < 1:
+        value, unit = 1e3 * value, "ms"
+    number = f"{value:,.4g}" if abs(value) < 1e4 else f"{value:,.0f}"
+    return number, "" if unit == "1" else unit.replace("m3", "m³")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run once and print the key figures; every field of `Settings` is an option."""
+    parser = argparse.ArgumentParser(
+        prog="explore",
+        description="Close one loop and print its key figures.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        allow_abbrev=False,
+    )
+    choices = {"controller": tuple(CONTROLLERS), "preset": tuple(presets.TUNINGS), "blocking": BLOCKING}
+    for field in dataclasses.fields(Settings):
+        option = f"--{field.name.replace('_', '-')}"
+        if isinstance(field.default, bool):
+            action = argparse.BooleanOptionalAction
+            parser.add_argument(option, action=action, default=field.default, help="-")
+        elif field.name in choices:
+            parser.add_argument(option, choices=choices[field.name], default=field.default, help="-")
+        else:
+            unit = FIELD_UNITS[field.name].replace("%", "%%")
+            given = "" if field.default is not None else ", the preset's if not given"
+            parser.add_argument(option, type=float, default=field.default, help=f"[{unit}]{given}")
+    options = vars(parser.parse_args(arguments))
+    try:
+        done = run(Settings(**options))
+    except InputError as error:
+        parser.error(str(error))
+    for words, unit, value in shown_figures(done):
+        number, shown = written(value, unit)
+        print(f"{words:28} {number:>12} {shown}")
+    print(f"{'this run, compilation included':28} {done.seconds:>10.3g} s")

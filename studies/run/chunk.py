@@ -1,0 +1,295 @@
+"""Computing the scenarios of a sweep study: one chunk in, arrays out. `run_chunk` is all that any executor calls.
+
+A chunk is a pure function of the prepared study and its number; nothing is read or written. All chunks of a group have one
+shape and share one compiled program: the last one is filled up with copies of its last scenario.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmpc.controller.batch import Lanes, controller_batch
+from jaxmpc.controller.mixed_integer import MixedIntegerControllers
+from jaxmpc.integer.relaxer import forget_programs
+from jaxmpc.loop.simulate import simulate_batches
+from jaxmpc.loop.trajectory import AXES, TrajectoryBatch
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.problem.tuning import stack_tunings
+from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS
+from studies.definition import presets
+from studies.definition.models import Point, identify_models
+from studies.definition.scenarios import Scenario, Study
+from studies.kpi.sweep import KPIS, RECORD, batch_kpis
+from studies.store.comparison import VARIABLES
+from studies.store.fingerprint import versions
+from studies.store.layout import FLAG, StoreLayout, Variable
+
+# A CV counts as settled within the deadzone of the thesis, whatever its own: otherwise a wide deadzone settles at once.
+SETTLED = tuple(presets.tuning_fields("thesis")["deadzone"][name] for name in CV_NAMES)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PreparedStudy:
+    """A study with the models that its controllers need; picklable, what every worker holds."""
+
+    study: Study
+    models: Mapping[Point, StepResponseModel]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ChunkResult:
+    """What a chunk leaves behind.
+
+    Attributes:
+        index: of the chunk.
+        fields: every stored variable, ``"lane ..."``, real lanes only.
+        facts: JSON-like: ``wall_time`` [s] and where it was computed.
+    """
+
+    index: int
+    fields: dict[str, np.ndarray]
+    facts: dict[str, Any]
+
+
+def prepare_study(study: Study, progress: Callable[[int, int], None] | None = None) -> PreparedStudy:
+    """Identify the models of a study; errors of `models.identify_models`."""
+    models = identify_models(study.model_points, progress=progress)
+    return PreparedStudy(study, {point: jax.tree.map(np.asarray, model) for point, model in models.items()})
+
+
+_program_before: list[tuple] = []  # the one of the last chunk in this process
+
+
+def run_chunk(prepared: PreparedStudy, index: int) -> ChunkResult:
+    """Run the closed loops of a chunk.
+
+    Args:
+        prepared: from `prepare_study`.
+        index: of the chunk.
+    """
+    study = prepared.study
+    chunk = study.chunks[index]
+    group, lanes = study.groups[chunk.group], study.lanes(chunk.group)
+    own = group.kind, group.actuator, group.structure, group.samples, group.has_limits, group.whole_steps
+    program = *own, group.switching, lanes
+    if _program_before != [program]:
+        if _program_before:
+            forget_programs()  # those of a dozen groups do not fit side by side
+        _program_before[:] = [program]
+    fields, facts = run_scenarios(
+        [study.scenario(int(k)) for k in chunk.scenarios],
+        prepared.models,
+        lanes=lanes,
+        shared_model=len(group.points) == 1,
+        plant_fields=study.varying_plant(chunk.group),
+        points=len(stored_times(study)),
+        every=study.definition.store.every,
+        trajectories=study.definition.store.trajectories,
+    )
+    return ChunkResult(index, fields, facts)
+
+
+def run_scenarios(
+    scenarios: Sequence[Scenario],
+    models: Mapping[Point, StepResponseModel],
+    *,
+    lanes: int,
+    points: int,
+    every: int,
+    trajectories: Sequence[str],
+    shared_model: bool = False,
+    plant_fields: Sequence[str] = (),
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Run scenarios of one group side by side.
+
+    Args:
+        scenarios: 1 to `lanes` of them.
+        models: by working point.
+        lanes: of the compiled program; it is filled up with copies of the last scenario.
+        points: length of the stored time axis; shorter runs end in NaN (-1 for codes).
+        every: samples from one stored point to the next.
+        trajectories: fields of `Trajectory` to keep.
+        shared_model: whether all scenarios of the group have one model.
+        plant_fields: parameters of the well that may differ from lane to lane.
+
+    Returns:
+        ``(fields, facts)`` as in `ChunkResult`.
+    """
+    begin = time.perf_counter()
+    filled = [*scenarios, *([scenarios[-1]] * (lanes - len(scenarios)))]
+    first = filled[0]
+    tunings = [s.tuning for s in filled]
+    stacked = stack_tunings(tunings)
+    model = [models[first.model_point]] if shared_model else [models[s.model_point] for s in filled]
+    controllers: Any
+    if first.kind == "mixed-integer":
+        controllers = MixedIntegerControllers(first.structure, tunings, model, count=lanes)
+    else:
+        shared = model[0] if shared_model else model
+        controllers = controller_batch(first.structure, stacked, shared)
+    references = [s.reference for s in filled]
+    disturbed = any(s.disturbance is not None for s in filled)
+    noisy = any(s.noise is not None for s in filled)
+    failing = any(s.faults is not None for s in filled)
+    seeds: Any = np.array([s.seed for s in filled])
+    still, quiet, sound = (
+        np.zeros(first.samples),
+        np.zeros(len(CV_NAMES)),
+        np.zeros((first.samples, len(CV_NAMES))),
+    )
+    batches = simulate_batches(
+        controllers,
+        _plants(filled, plant_fields),
+        references,
+        samples=first.samples,
+        disturbance=np.stack([still if s.disturbance is None else s.disturbance for s in filled])
+        if disturbed
+        else None,
+        noise=np.stack([quiet if s.noise is None else s.noise for s in filled]) if noisy else None,
+        seed=seeds,
+        faults=np.stack([sound if s.faults is None else s.faults for s in filled]) if failing else None,
+        position_feedback=np.array([s.position_feedback for s in filled]),
+        record=tuple(dict.fromkeys((*RECORD, *(f for f in trajectories if f != "setpoint")))),
+        lanes_at_once=lanes,
+    )
+    (batch,) = batches
+    simulated = time.perf_counter()
+    windows = np.stack([s.reference.window(s.structure.dt, s.samples) for s in filled])
+    figures = batch_kpis(batch, stacked, windows, tolerance=np.array(SETTLED))
+    fields = {name: values[: len(scenarios)] for name, values in figures.items()}
+    fields[FLAG] = fields["finite"].astype("i1")
+    for field in trajectories:
+        fields[stored_name(field)] = _kept(batch, field, len(scenarios), every, points)
+    facts = {
+        "wall_time": time.perf_counter() - begin,
+        "simulation_time": simulated - begin,
+        "lanes": lanes,
+        "scenarios": len(scenarios),
+        "device": jax.devices()[0].device_kind,
+        "host": platform.node(),
+        "process": os.getpid(),
+    }
+    return fields, facts
+
+
+def _plants(scenarios: Sequence[Scenario], fields: Sequence[str]) -> Lanes[WellPlant] | WellPlant:
+    """One well per lane, parameters that do not vary within the group kept once; or one for all."""
+    first = scenarios[0]
+    if not fields:
+        return WellPlant(parameters=first.plant, actuator=first.actuator)
+    varying = {name: jnp.array([getattr(s.plant, name) for s in scenarios]) for name in fields}
+    plants = WellPlant(parameters=dataclasses.replace(first.plant, **varying), actuator=first.actuator)
+    places = lambda plant: [getattr(plant.parameters, name) for name in fields]  # noqa: E731
+    has_lanes = eqx.tree_at(places, jax.tree.map(lambda _: False, plants), [True] * len(fields))
+    return Lanes(*eqx.partition(plants, has_lanes))
+
+
+def _kept(batch: TrajectoryBatch, field: str, lanes: int, every: int, points: int) -> np.ndarray:
+    """A trajectory at the stored times, filled up to their number."""
+    kind, empty = VARIABLES[field_key(field)][2:4] if field != "setpoint" else ("f8", np.nan)
+    values = batch.setpoint if field == "setpoint" else batch[field]
+    values = np.asarray(values)[:lanes, ::every]
+    out = np.full((lanes, points, *values.shape[2:]), empty, dtype=kind)
+    out[:, : values.shape[1]] = values
+    return out
+
+
+def field_key(field: str) -> str:
+    """The entry of `studies.store.comparison.VARIABLES` that holds a field of `Trajectory`."""
+    return next(name for name, (source, *_) in VARIABLES.items() if source == field)
+
+
+def stored_name(field: str) -> str:
+    """Name of the stored trajectory of a field of `Trajectory`; a key figure has the name ``objective`` already."""
+    if field == "setpoint":
+        return field
+    return {"objective": "plan_objective"}.get(field_key(field), field_key(field))
+
+
+def stored_times(study: Study) -> np.ndarray:
+    """Times of the stored points of the longest run [s]."""
+    longest = max(study.groups, key=lambda group: group.samples)
+    return np.arange(0, longest.samples, study.definition.store.every) * longest.structure.dt
+
+
+def study_layout(study: Study, command: str | None = None) -> StoreLayout:
+    """What the store has to know of a study.
+
+    Args:
+        study: the study.
+        command: words after ``jaxmpc study run`` that give it: a shipped name or a file, and ``--quick``.
+    """
+    noise = "the column seed" if any(c.key == "seed" for c in study.columns) else study.scenario(0).seed
+    return StoreLayout(
+        name=study.name,
+        title=study.title,
+        study_hash=study.hash,
+        chunk_size=study.chunk_size,
+        chunk_scenarios=tuple(chunk.scenarios for chunk in study.chunks),
+        scenario_hashes=study.scenario_hashes,
+        columns=study.columns,
+        variables=stored_variables(study.definition.store.trajectories),
+        coords={
+            "time": (stored_times(study), "s", "time"),
+            "cv": (list(CV_NAMES), "", "controlled variable"),
+            "mv": (list(MV_NAMES), "", "manipulated variable"),
+            "cv_unit": (list(CV_UNITS), "", "unit of the CV"),
+            "mv_unit": (list(MV_UNITS), "", "unit of the MV"),
+        },
+        provenance={
+            "definition": strict_json(study.definition.body),
+            **({} if command is None else {"definition_file": command}),
+            "folder": str(study.definition.folder),
+            "quick": study.definition.is_cut,
+            "seeds": {"sampling": study.definition.sampling.seed, "noise": noise},
+            "versions": versions(),
+            "settled": dict(zip(CV_NAMES, SETTLED, strict=True)),
+            "work": dataclasses.asdict(study.work),
+            "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        },
+    )
+
+
+def strict_json(value: Any) -> Any:
+    """A definition with its infinite numbers, for which JSON has no word, as ``{"number": "inf"}``."""
+    if isinstance(value, Mapping):
+        return {str(key): strict_json(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [strict_json(entry) for entry in value]
+    return {"number": str(value)} if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def from_strict_json(value: Any) -> Any:
+    """The definition that `strict_json` was given."""
+    if isinstance(value, dict):
+        plain = {key: from_strict_json(entry) for key, entry in value.items()}
+        return float(plain["number"]) if list(plain) == ["number"] else plain
+    return [from_strict_json(entry) for entry in value] if isinstance(value, list) else value
+
+
+def stored_variables(trajectories: Sequence[str]) -> tuple[Variable, ...]:
+    """Key figures, the flag of a complete run, and trajectories."""
+    figures = [Variable(k.name, k.long_name, k.unit, k.dims) for k in KPIS]
+    flag = Variable(FLAG, "1 where every CV and MV of the run is finite", "1", (), "i1", 0)
+    over_time = []
+    for field in trajectories:
+        axis = next(axis for axis, names in AXES.items() if field in names)
+        dims = ("time", axis) if axis else ("time",)
+        if field == "setpoint":
+            over_time.append(Variable("setpoint", "setpoint", "cv_unit", dims))
+            continue
+        _, _, kind, empty, long_name, unit = VARIABLES[field_key(field)]
+        over_time.append(Variable(stored_name(field), long_name, unit, dims, kind, empty))
+    return (*figures, flag, *over_time)

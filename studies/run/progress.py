@@ -1,0 +1,72 @@
+"""The bar of a run: scenarios done, the rate so far, and the time left as the chunks of every group tell it."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from tqdm import tqdm
+
+from studies.run.estimate import Pace, Work, readable
+
+LAYOUT = "{l_bar}{bar}| {n_fmt}/{total_fmt} scenarios [{elapsed}{postfix}]"
+
+
+class Progress:
+    """A bar that is told of every chunk."""
+
+    def __init__(self, bar: tqdm, pace: Pace):
+        """Use `progress_bar`."""
+        self._bar, self._pace = bar, pace
+        self._begin, self._scenarios = time.monotonic(), 0
+
+    def add(self, chunk: int, facts: Mapping[str, Any], scenarios: int, more: str = "") -> None:
+        """A chunk was computed.
+
+        Args:
+            chunk: its number.
+            facts: of the chunk.
+            scenarios: how many it has.
+            more: to be shown beside rate and time left.
+        """
+        self._pace.add(chunk, facts)
+        self._scenarios += scenarios
+        passed = max(time.monotonic() - self._begin, 1e-9)
+        words = [f"{self._scenarios / passed:.3g} per second", more]
+        left = self._pace.left
+        if not math.isnan(left) and left > 0:
+            words.insert(0, f"about {readable(left)} left")
+        self._bar.set_postfix_str(", ".join(filter(None, words)), refresh=False)
+        self._bar.update(scenarios)
+
+
+@contextlib.contextmanager
+def progress_bar(
+    name: str, total: int, stored: int, work: Work, done: Mapping[int, Mapping[str, Any]], show: bool
+) -> Iterator[Progress]:
+    """Show a bar while chunks are computed.
+
+    Args:
+        name: of the study.
+        total: scenarios.
+        stored: scenarios that are stored already.
+        work: of the study.
+        done: facts of the chunks that are stored already.
+        show: whether to show it.
+    """
+    often = 0.5 if sys.stderr.isatty() else 10.0  # s; a log file needs no more
+    with tqdm(
+        desc=name,
+        total=total,
+        initial=stored,
+        bar_format=LAYOUT,
+        disable=not show,
+        dynamic_ncols=True,
+        mininterval=often,
+    ) as bar:
+        bar.set_postfix_str("time left is known after the first chunk")
+        yield Progress(bar, Pace(work, done))

@@ -1,0 +1,123 @@
+"""One scenario of a stored sweep, run again with everything recorded: to look closely at a point of a plot."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.errors import InputError
+from jaxmpc.files import write_atomically
+from jaxmpc.loop.simulate import simulate
+from jaxmpc.loop.trajectory import AXES, Trajectory
+from jaxmpc.process.plant import WellPlant
+from studies.definition.models import identify_models
+from studies.definition.scenarios import Study
+from studies.definition.sweep import StudyDefinition
+from studies.run.chunk import from_strict_json
+from studies.search.study import SearchStudy
+from studies.store.comparison import provenance
+from studies.store.reading import open_study
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Rerun:
+    """A scenario that was run again.
+
+    Attributes:
+        trajectory: every sample of it.
+        deadzone: ``"cv"``, of its tuning [CV unit].
+        title: study, number and the values of its axes.
+        kind: of its controller.
+        actuator: of its choke.
+    """
+
+    trajectory: Trajectory
+    deadzone: np.ndarray
+    title: str
+    kind: str
+    actuator: str
+
+    def save(self, folder: Path) -> Path:
+        """Write the trajectory as netCDF; returns the file."""
+        t = self.trajectory
+        fields = {}
+        for axis, names in AXES.items():
+            for name in names:
+                if name != "time":
+                    values = np.asarray(getattr(t, name))
+                    values = values.astype("i4") if values.dtype.kind in "bui" else values
+                    # an axis and a field may not have one name
+                    key = f"{name}_value" if name in ("cv", "mv") else name
+                    fields[key] = (("time", axis) if axis else ("time",), values)
+        coords = {
+            "time": ("time", t.time, {"units": "s"}),
+            "cv": ("cv", list(t.cv_names)),
+            "mv": ("mv", list(t.mv_names)),
+        }
+        data = xr.Dataset(fields, coords, {"title": self.title})
+        return write_atomically(folder / "trajectory.nc", lambda path: data.to_netcdf(path, engine="scipy"))
+
+
+def study_of(store: Path) -> Study:
+    """The study that a store was made from, expanded again from the definition that is stored with it.
+
+    Raises:
+        InputError: if there is no store, or a file that the definition needs is gone.
+    """
+    with open_study(store) as data:
+        body, folder = provenance(data, "definition"), provenance(data, "folder")
+        quick = provenance(data, "quick")
+    if not isinstance(body, dict):
+        raise InputError("store", str(store), "a store of a sweep study, with its definition")
+    definition = StudyDefinition.from_dict(from_strict_json(body), folder or ".")
+    made = definition.expand(quick=bool(quick), confirmed=True)
+    return made.evaluated(store) if isinstance(made, SearchStudy) else made
+
+
+def rerun(store: Path, number: int) -> Rerun:
+    """Run a scenario again, alone.
+
+    Args:
+        store: of a sweep study.
+        number: of the scenario.
+
+    Raises:
+        InputError: for a store or a number that does not exist.
+
+    Warns:
+        UserWarning: if definition files or code have changed since, so that the run may differ from the stored one.
+    """
+    study = study_of(store)
+    scenario = study.scenario(number)
+    with open_study(store) as data:
+        stored = data.scenario_hash.values
+    if number >= len(stored) or str(stored[number]) != study.scenario_hash(number):
+        warnings.warn(
+            f"scenario {number} was stored by other code or inputs; it may differ now", stacklevel=2
+        )
+    model = identify_models([scenario.model_point])[scenario.model_point]
+    kind = MixedIntegerController if scenario.kind == "mixed-integer" else ContinuousController
+    trajectory = simulate(
+        kind(scenario.structure, scenario.tuning, model),
+        WellPlant(parameters=scenario.plant, actuator=scenario.actuator),
+        scenario.reference,
+        samples=scenario.samples,
+        disturbance=scenario.disturbance,
+        noise=scenario.noise,
+        faults=scenario.faults,
+        position_feedback=scenario.position_feedback,
+        seed=scenario.seed,
+    )
+    shown = lambda value: f"{value:g}" if isinstance(value, float) else value  # noqa: E731
+    values = [
+        f"{c.key} = {shown(c.values[number])}{f' {c.unit}' if c.unit not in ('', '1') else ''}"
+        for c in study.columns
+    ]
+    title = f"{study.name}, scenario {number}: {', '.join(values)}"
+    return Rerun(trajectory, np.asarray(scenario.tuning.deadzone), title, scenario.kind, scenario.actuator)

@@ -1,0 +1,1 @@
+"""Stores of results and what they say about themselves."""

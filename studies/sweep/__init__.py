@@ -1,1 +1,0 @@
-"""Sweep studies: many tunings, wells and references from one definition, in one store."""

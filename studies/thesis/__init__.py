@@ -1,0 +1,1 @@
+"""The comparisons and claims of the thesis."""

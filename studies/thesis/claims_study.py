@@ -1,0 +1,173 @@
+"""Every statement of thesis chapters 6 to 8 as a measured row: runs the studies that the rows need, and writes the tables.
+
+`jaxmpc study run claims` calls `run_claims`. All numbers come from stored results, but for times of controller steps on the
+JAX well: its loops run compiled, so that a sample has no time of its own, and some loops are run again on the host for it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from jaxmpc.errors import InputError
+from jaxmpc.files import write_atomically
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.host import HostWell
+from studies.definition.comparison import PLANTS, ComparisonDefinition, PlantKind, ReferenceDefinition
+from studies.run.comparison import is_current, run_controller
+from studies.store.comparison import check_writable, open_results
+from studies.thesis import catalogue
+from studies.thesis.claims import ROWS, Claim, Evidence, judge, tables
+
+FORMAT = "jaxmpc/claims/1"
+NEEDED = tuple(dict.fromkeys(row.study for row in ROWS))  # keys of `studies.thesis.catalogue.STUDIES`
+TIMED = 18_000.0  # s of a run that are run again for its times: three targets of the thesis reference
+GALLERY = "../../figures-out/index.html"  # where `jaxmpc figures all` puts it
+
+
+def run_claims(
+    out: str | Path = "results",
+    quick: bool = False,
+    plant: PlantKind = "fmu",
+    *,
+    progress: bool = True,
+    say: Callable[[str], None] = print,
+    gallery: str = GALLERY,
+) -> Path:
+    """Measure every row on the studies of the catalogue; what of them is stored and current is not run again.
+
+    Args:
+        out: folder of all results; the tables go to ``claims-PLANT`` or ``claims-quick-PLANT`` in it.
+        quick: measure the shortened studies.
+        plant: ``fmu``, or ``jax`` for its JAX twin, which needs no C compiler.
+        progress: whether to show bars with rate and time left.
+        say: receives one line per event.
+        gallery: page of the figures for the links of ``claims.html``, relative to it.
+
+    Returns:
+        The folder with ``claims.md``, ``claims.csv``, ``claims.json`` and ``claims.html``.
+
+    Raises:
+        InputError: for an unknown plant or a folder that cannot be written, before anything is computed.
+        MissingToolError: if the FMU cannot be built.
+    """
+    if plant not in PLANTS:
+        raise InputError("plant", plant, f"one of {', '.join(PLANTS)}")
+    folder = check_writable(Path(out) / f"claims-{'quick-' if quick else ''}{plant}")
+    found: dict[str, Claim] = {}
+    hashes: dict[str, str] = {}
+    for study in NEEDED:
+        definition = catalogue.STUDIES[study](quick, plant)
+        results = Path(out) / definition.name
+        if is_current(definition, results):
+            say(f"{results}: complete.")
+        else:
+            results = catalogue.run_named(study, out, quick, plant, progress=progress, say=say)
+        data = open_results(results).load()
+        hashes[study] = str(data.attrs["study_hash"])
+        clock = None
+        if plant == "jax":
+            clock = _Clock(definition, results, folder / "times.json", progress, say)
+        evidence = Evidence.of(data, clock)
+        found |= {row.id: judge(row, evidence) for row in ROWS if row.study == study}
+    claims = [found[row.id] for row in ROWS]
+    write_tables(claims, folder, quick, plant, hashes, gallery)
+    say(f"{tables.tally(claims)}: {folder / 'claims.html'}")
+    return folder
+
+
+def write_tables(
+    claims: list[Claim],
+    folder: Path,
+    quick: bool,
+    plant: PlantKind,
+    hashes: dict[str, str],
+    gallery: str = GALLERY,
+) -> None:
+    """Write the rows as ``claims.md``, ``claims.csv``, ``claims.json`` and ``claims.html``, each in one go.
+
+    Args:
+        claims: measured.
+        folder: for the files.
+        quick: whether the shortened studies were measured.
+        plant: of the studies.
+        hashes: which results were measured, study by study.
+        gallery: see `run_claims`.
+    """
+    title = "The statements of the thesis, measured"
+    well = "an FMU of the well" if plant == "fmu" else "the JAX twin of the well"
+    note = f"Measured on our own runs: {'shortened' if quick else 'full'} studies, {well}."
+    body = {
+        "format": FORMAT,
+        "quick": quick,
+        "plant": plant,
+        "results": hashes,
+        "claims": msgspec.to_builtins(claims),
+    }
+    write_atomically(folder / "claims.md", tables.markdown(claims, title))
+    write_atomically(folder / "claims.csv", tables.table_csv(claims))
+    write_atomically(folder / "claims.json", json.dumps(body, indent=1, ensure_ascii=False))
+    write_atomically(folder / "claims.html", tables.page(claims, title, note, gallery))
+
+
+class _Clock:
+    """Times of controller steps by the name of the run; measured once, then read from a file."""
+
+    def __init__(
+        self, definition: ComparisonDefinition, results: Path, file: Path, progress: bool, say: Callable
+    ):
+        self.definition, self.results, self.file = definition, results, file
+        self.progress, self.say = progress, say
+
+    def __call__(self, name: str) -> np.ndarray:
+        with open_results(self.results) as data:
+            key = str(data.sel(controller=name).content_hash.item())
+        known = _read(self.file, self.say)
+        if key not in known:
+            self.say(f"{self.definition.name}, {name}: timed on the host.")
+            known[key] = step_times(
+                self.definition, name, StepResponseModel.load(self.results / "model.json"), self.progress
+            ).tolist()
+            write_atomically(self.file, json.dumps(known))
+        return np.array(known[key])
+
+
+def _read(file: Path, say: Callable[[str], None]) -> dict[str, list[float]]:
+    """Times that were measured before; none if the file is missing or damaged."""
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=dict[str, list[float]])
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, RecursionError) as error:
+        say(f"{file} is damaged and is measured anew ({error}).")
+        return {}
+
+
+def step_times(
+    definition: ComparisonDefinition, name: str, model: StepResponseModel, progress: bool = False
+) -> np.ndarray:
+    """Times of the controller steps of a run on the JAX well [s], ``"sample"``: its first `TIMED` seconds, on the host.
+
+    Args:
+        definition: of the study.
+        name: of the controller.
+        model: its prediction model.
+        progress: whether to show a bar.
+    """
+    whole = definition.reference
+    duration = min(whole.duration, TIMED)
+    kept = [i for i, start in enumerate(whole.times) if start < duration]
+    reference = ReferenceDefinition(
+        tuple(whole.times[i] for i in kept), tuple(whole.setpoints[i] for i in kept), duration
+    )
+    part = msgspec.structs.replace(definition, reference=reference)
+    controller = next(one for one in definition.controllers if one.name == name)
+    run = run_controller(
+        controller, part, model, lambda actuator: HostWell(WellPlant(actuator=actuator)), progress
+    )
+    return np.asarray(run.solve_time)

@@ -1,0 +1,148 @@
+"""Plans of a stored run and what their controller expected of them, from stored variables alone (figures 25, 26, 36-38).
+
+The prediction is the controller's own (2.30), (2.31): the CVs that the run started from, the bias, what past moves
+will still do, and what the planned moves will do.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import xarray as xr
+
+from jaxmpc.errors import InputError
+from studies.definition.presets import CHOKE
+from studies.kpi import loop as kpi
+from studies.store.comparison import provenance
+
+SMALLEST_MOVE = 1e-6  # % choke, less is rounding
+LONGEST_SWING = 1000.0  # s
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class StoredPlan:
+    """What a controller planned at one time.
+
+    Attributes:
+        time: when the plan was made [s].
+        move: ``"sample mv"``, planned moves of the Hu samples, row 0 the move made at `time` [MV unit].
+        mv: ``"sample mv"``, the MVs after each of these moves [MV unit].
+        cv: ``"horizon cv"``, predicted CVs at 1..Hp samples after `time` [CV unit].
+        dt: sampling interval [s].
+    """
+
+    time: float
+    move: np.ndarray
+    mv: np.ndarray
+    cv: np.ndarray
+    dt: float
+
+    @property
+    def move_time(self) -> np.ndarray:
+        """Start of each sample of `move` and `mv`, ``"sample"`` [s]."""
+        return self.time + self.dt * np.arange(len(self.move))
+
+    @property
+    def cv_time(self) -> np.ndarray:
+        """When each row of `cv` is expected to be measured, ``"horizon"`` [s]."""
+        return self.time + self.dt * np.arange(1, len(self.cv) + 1)
+
+
+def plan_at(data: xr.Dataset, controller: str, time: float) -> StoredPlan:
+    """The plan that a controller made at a time, with its prediction.
+
+    Args:
+        data: results from `studies.store.comparison.open_results`.
+        controller: name of a finished run.
+        time: of the plan [s]; that of the sample that holds it counts.
+
+    Raises:
+        InputError: for an unknown or unfinished controller, a time outside the run, or one at which no plan was made.
+    """
+    run = _finished(data, controller)
+    written = provenance(data, "definition")["controllers"]
+    if any(entry.get("schedule") for entry in written if entry["name"] == controller):
+        raise InputError(
+            "controller", controller, "one with a single model; those of a gain schedule are not stored"
+        )
+    dt = float(data.attrs["dt"])
+    times = data.time.values
+    k = int(np.floor(time / dt + 1e-9)) if np.isfinite(time) else -1
+    if not 0 <= k < len(times):
+        raise InputError("time", time, f"a time of the run, {times[0]:g} to {times[-1]:g} s")
+    move = _sample_moves(run, run.plan.values[k])
+    if np.isnan(move).any():
+        raise InputError(
+            "time", time, "a time at which a plan was made, not one at which a plan is carried out"
+        )
+    made = run.move.values[:k]
+    horizon = int(run.prediction_horizon)
+    steps = data.model_coefficient.values  # "cv mv lag", S(1)..S(N)
+    cv = run.measurement.values[0] + run.bias.values[k] + np.zeros((horizon, 1))
+    for i in np.flatnonzero(made.any(axis=1)).tolist():
+        cv += _response(steps, made[i], horizon, k - i)
+    for i in np.flatnonzero(move.any(axis=1)).tolist():
+        cv[i:] += _response(steps, move[i], horizon - i, 0)
+    before = run.demand.values[k] - run.move.values[k]
+    return StoredPlan(float(times[k]), move, before + np.cumsum(move, axis=0), cv, dt)
+
+
+def oscillation_moves(data: xr.Dataset, controller: str, around: float) -> tuple[float, float, float]:
+    """Times of three choke moves of an oscillation: the first of a swing, of the swing back, and of the one after it.
+
+    A swing is all moves in one direction until the choke turns, often a single move. Swings that begin more than
+    `LONGEST_SWING` after each other are no oscillation.
+
+    Args:
+        data: results from `studies.store.comparison.open_results`.
+        controller: name of a finished run.
+        around: the oscillation whose second swing begins nearest to this time is taken [s].
+
+    Returns:
+        Starts of the samples whose moves they are [s].
+
+    Raises:
+        InputError: for an unknown or unfinished controller, and where the choke never oscillates.
+    """
+    run = _finished(data, controller)
+    choke = list(data.mv.values).index(CHOKE)
+    start = run.demand.values[0, choke] - run.move.values[0, choke]
+    moves = np.asarray(kpi.moves_of(run.position.values[:, choke], start))
+    at = np.flatnonzero(np.abs(moves) > SMALLEST_MOVE)
+    turned = np.sign(moves[at[1:]]) != np.sign(moves[at[:-1]])
+    begin = data.time.values[at[np.r_[True, turned][: at.size]]]
+    soon = np.diff(begin) <= LONGEST_SWING
+    middle = 1 + np.flatnonzero(soon[:-1] & soon[1:])
+    if middle.size == 0:
+        raise InputError("controller", controller, "a run in which the choke oscillates")
+    best = middle[np.argmin(np.abs(begin[middle] - around))]
+    first, second, third = begin[best - 1 : best + 2].tolist()
+    return first, second, third
+
+
+def _finished(data: xr.Dataset, controller: str) -> xr.Dataset:
+    names = list(data.controller.values)
+    finished = [name for name, done in zip(names, data.complete.values, strict=True) if done == 1]
+    if controller not in finished:
+        raise InputError(
+            "controller", controller, f"a finished run: {', '.join(finished) or 'there is none'}"
+        )
+    return data.isel(controller=names.index(controller))
+
+
+def _sample_moves(run: xr.Dataset, blocks: np.ndarray) -> np.ndarray:
+    """Moves of the Hu samples, ``"sample mv"``, from block moves ``"block mv"``."""
+    lengths = run.block_length.values
+    blocks, lengths = blocks[lengths > 0], lengths[lengths > 0]
+    if str(run.blocking.values) != "inputs":  # a move is made again in every sample of its block
+        return np.repeat(blocks, lengths, axis=0)
+    out = np.zeros((int(lengths.sum()), blocks.shape[1]))
+    out[np.cumsum(lengths) - lengths] = blocks
+    return out
+
+
+def _response(steps: np.ndarray, move: np.ndarray, horizon: int, age: int) -> np.ndarray:
+    """Effect ``"horizon cv"`` of a move made `age` samples ago, at 1..`horizon` samples from now; S(N+1) = S(N)."""
+    lag = np.minimum(np.arange(age, age + horizon), steps.shape[2] - 1)
+    return np.einsum("cmh,m->hc", steps[:, :, lag], move)

@@ -1,0 +1,255 @@
+"""Real-time optimisation above the controller (thesis 6.7): low demands with and without it, from nothing to results.
+
+Some demanded rates can only be met with a little lift, 0 to 2000 m3/h, where a well slugs. `run_rto` lets the same
+mixed-integer controller follow the demands as they are, and follow what `steady.optimise` makes of them: rates within the
+demands' deadzones that need no such lift, and the choke and lift that belong to them as input targets (6.20).
+`figures.thesis.rto` draws the results.
+"""
+
+from __future__ import annotations
+
+import datetime
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from identify.steady_map import steady_map
+from identify.step_test import identify_step_response
+from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.controller.targets import TargetController, simulate_with_targets
+from jaxmpc.errors import InputError
+from jaxmpc.files import write_atomically
+from jaxmpc.loop.reference import Reference
+from jaxmpc.loop.simulate import simulate
+from jaxmpc.steady.map import SteadyMap
+from jaxmpc.steady.optimise import LIFT_RANGES, Targets, optimise
+from studies.definition import presets
+from studies.definition.comparison import PLANTS, PlantKind
+from studies.definition.presets import CHOKE, GAS, LIFT, OIL
+from studies.run.comparison import closing, progress_bar
+from studies.store.comparison import ResultStore, check_writable, locked, open_results, results_template
+from studies.store.fingerprint import content_hash, module_hash, source_hash, versions
+from studies.thesis.comparison import plant_factory
+
+WITHOUT, WITH = "without-rto", "with-rto"
+LABELS = {WITHOUT: "mixed-integer MPC", WITH: "mixed-integer MPC below an RTO"}
+# start [s], gas rate [m3/h], oil rate [m3/h]
+WINDOWS = (
+    (0, 11013, 185),  # the working point
+    (3600, 2700, 81),  # met with about 1600 m3/h of lift
+    (12000, 1750, 54),  # met with about 1050 m3/h
+    (20400, 9640, 152),
+)
+DURATION, QUICK_DURATION = 28_800.0, 12_000.0  # s; the quick run ends before the third window
+PRICES = {GAS: 0.1, OIL: 400.0, LIFT: 0.3}  # per m3
+SETTLED = 300.0  # s at the end of a window that stand for where a run settles
+TARGET_WEIGHT = {CHOKE: 1.0, LIFT: 1e-3}  # 1/(%)^2, 1/(m3/h)^2
+
+
+def demands(quick: bool = False) -> Reference:
+    """Demanded gas and oil rate [m3/h] over time; the first two windows alone if `quick`."""
+    duration = QUICK_DURATION if quick else DURATION
+    rows = [row for row in WINDOWS if row[0] < duration]
+    return Reference([row[0] for row in rows], [row[1:] for row in rows], duration)
+
+
+def targets_of(steady: SteadyMap, demanded: Reference, deadzone: np.ndarray) -> list[Targets]:
+    """What the real-time optimisation makes of each demand: the most profitable point within its deadzone.
+
+    Args:
+        steady: map of the well.
+        demanded: rates over time.
+        deadzone: half width per CV [CV unit].
+    """
+    return [
+        optimise(steady, PRICES, rates - deadzone, rates + deadzone, choke_step=presets.CHOKE_STEP)
+        for rates in demanded.setpoints
+    ]
+
+
+def run_rto(
+    out: str | Path = "results",
+    quick: bool = False,
+    plant: PlantKind = "jax",
+    *,
+    progress: bool = True,
+    say: Callable[[str], None] = print,
+) -> Path:
+    """Compute and store both runs; what is stored already with equal inputs is kept.
+
+    Args:
+        out: folder of all results; this study gets its own folder in it.
+        quick: 1,200 instead of 2,880 samples.
+        plant: ``jax``, or ``fmu``, whose steady map takes longer.
+        progress: whether to show bars with rate and time left.
+        say: receives one line per event.
+
+    Returns:
+        The folder of the study, with ``results.zarr`` (see `studies.store.comparison.open_results`), ``model.json``,
+        ``steady_map.json`` and ``summary.md``, where both runs settle.
+
+    Raises:
+        InputError: for an unknown plant or a folder that cannot be written, before anything is computed.
+        MissingToolError: if the FMU cannot be built.
+    """
+    if plant not in PLANTS:
+        raise InputError("plant", plant, f"one of {', '.join(PLANTS)}")
+    folder = check_writable(Path(out) / f"rto-{'quick-' if quick else ''}{plant}")
+    demanded = demands(quick)
+    with locked(folder):
+        make_plant, facts = plant_factory(plant, say)
+        with closing(make_plant("continuous")) as tested:
+            model = identify_step_response(tested)
+            steady = steady_map(tested)
+        model.save(folder / "model.json")
+        steady.save(folder / "steady_map.json")
+        structure = presets.structure(integer=True)
+        tuning = presets.tuning(structure)
+        found = targets_of(steady, demanded, np.asarray(tuning.deadzone))
+        for rates, each in zip(demanded.setpoints, found, strict=True):
+            say(
+                f"Demand {rates[0]:.0f} / {rates[1]:.0f} m3/h: gas {each.cv[0]:.0f}, oil {each.cv[1]:.0f} m3/h "
+                f"with {each.mv[0]:.0f} % choke and {each.mv[1]:.0f} m3/h lift. {each.message}"
+            )
+        code = {package: source_hash(package) for package in ("jaxmpc", "identify")}
+        code |= {
+            name: module_hash(name)
+            for name in ("jaxmpc.steady.optimise", "jaxmpc.steady.milp", "jaxmpc.steady.map")
+        }
+        inputs = {
+            "plant": facts,
+            "model": np.asarray(model.coefficients),
+            "map": steady.cv,
+            "demands": [demanded.times.tolist(), demanded.setpoints.tolist(), demanded.duration],
+            "prices": PRICES,
+            "tuning": presets.tuning_fields(),
+            "code": code,
+        }
+        hashes = [content_hash(inputs, WITHOUT), content_hash(inputs, WITH, TARGET_WEIGHT)]
+        study_hash = content_hash(folder.name, hashes)
+        provenance = {
+            "study": folder.name,
+            "title": "Low demands: mixed-integer MPC with and without real-time optimisation",
+            "dt": structure.dt,
+            "plant": facts,
+            "prices": PRICES,
+            "target_weight": TARGET_WEIGHT,
+            "lift_ranges": [list(pair) for pair in LIFT_RANGES],
+            "messages": [each.message for each in found],
+            "code": code,
+            "versions": versions(),
+            "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        }
+
+        def template() -> xr.Dataset:
+            return results_template(
+                controllers=list(LABELS),
+                labels=list(LABELS.values()),
+                hashes=hashes,
+                time=structure.dt * np.arange(demanded.samples(structure.dt)),
+                cv_names=structure.cv_names,
+                mv_names=structure.mv_names,
+                cv_units=structure.cv_units,
+                mv_units=structure.mv_units,
+                blocks=structure.block_count,
+                shared=_shared(demanded, found, tuning, steady, structure.dt),
+                provenance=provenance,
+                study_hash=study_hash,
+            )
+
+        store = ResultStore.begin(folder, list(LABELS), study_hash, template, say)
+        over = lambda rows: Reference(demanded.times, rows, demanded.duration)  # noqa: E731
+        for name, label in LABELS.items():
+            if store.complete(name):
+                say(f"{label}: stored already.")
+                continue
+            started = time.perf_counter()
+            with closing(make_plant("step")) as well, progress_bar(label, progress) as report:
+                if name == WITHOUT:
+                    controller = MixedIntegerController(structure, tuning, model)
+                    run = simulate(controller, well, demanded, progress=report)
+                else:
+                    controller = TargetController(structure, tuning, model, TARGET_WEIGHT)
+                    setpoints, ideal = over([t.cv for t in found]), over([t.mv for t in found])
+                    run = simulate_with_targets(controller, well, setpoints, ideal, progress=report)
+            wall_time = time.perf_counter() - started
+            store.write(name, run, wall_time)
+            say(f"{label}: {run.samples} samples in {wall_time:.1f} s.")
+    write_atomically(folder / "summary.md", markdown(open_results(folder).load()))
+    return folder
+
+
+def markdown(data: xr.Dataset) -> str:
+    """Where both runs settle for each demand as a Markdown table: means over the last `SETTLED` seconds of its window.
+
+    Args:
+        data: results of `run_rto`, both runs finished.
+    """
+    lines = [
+        f"# {data.attrs['title']}",
+        "",
+        "| gas / oil demanded [m3/h] | run | choke [%] | lift [m3/h] | gas / oil off the demand [m3/h] | half widths off |",
+        "|---|---|---|---|---|---|",
+    ]
+    window, half = data.window.values, data.tuning_deadzone.isel(controller=0)
+    samples = round(SETTLED / float(data.attrs["dt"]))
+    for w in range(int(window.max()) + 1):
+        end = data.isel(time=np.flatnonzero(window == w)[-samples:])
+        rates = end.demanded.isel(time=-1)
+        for name in data.controller.values:
+            run = end.sel(controller=name)
+            off = (run.measurement - rates).mean("time")
+            choke, lift = (float(run.position.sel(mv=mv).mean()) for mv in (CHOKE, LIFT))
+            far = float((np.abs(off) / half).max())
+            lines.append(
+                f"| {float(rates.sel(cv=GAS)):.0f} / {float(rates.sel(cv=OIL)):.0f} | {run.label.item()} | {choke:.1f} | "
+                f"{lift:.0f} | {float(off.sel(cv=GAS)):+.0f} / {float(off.sel(cv=OIL)):+.1f} | {far:.2f} |"
+            )
+    return "\n".join([*lines, ""])
+
+
+def _shared(
+    demanded: Reference, found: list[Targets], tuning, steady: SteadyMap, dt: float
+) -> dict[str, xr.DataArray]:
+    """Demands, setpoints, targets, tuning and the steady map, as variables of the results."""
+    window = demanded.window(dt)
+    rates = demanded.sample(dt)
+    cv, mv = (np.array([getattr(t, key) for t in found])[window] for key in ("cv", "mv"))
+    text = np.dtypes.StringDType()
+    of_each = lambda value: xr.DataArray(np.array([value] * 2, dtype=text), dims="controller")  # noqa: E731
+    variables: dict[str, tuple[Any, tuple[str, ...], str, str]] = {
+        "demanded": (rates, ("time", "cv"), "demanded CV", "cv_unit"),
+        "setpoint": (np.stack([rates, cv]), ("controller", "time", "cv"), "setpoint", "cv_unit"),
+        "target": (
+            np.stack([np.full_like(mv, np.nan), mv]),
+            ("controller", "time", "mv"),
+            "input target",
+            "mv_unit",
+        ),
+        "window": (window.astype("i4"), ("time",), "index of the demand", "1"),
+        "profit": (np.array([t.profit for t in found]), ("demand",), "steady profit of the target", "1/h"),
+        "tuning_deadzone": (
+            np.tile(tuning.deadzone, (2, 1)),
+            ("controller", "cv"),
+            "half width of the deadzone",
+            "cv_unit",
+        ),
+    }
+    out = {
+        name: xr.DataArray(values, dims=dims, attrs={"long_name": long_name, "units": unit})
+        for name, (values, dims, long_name, unit) in variables.items()
+    }
+    out["map_rate"] = xr.DataArray(
+        steady.cv,
+        dims=("cv", "map_lift", "map_choke"),
+        coords={
+            "map_choke": ("map_choke", steady.choke, {"long_name": "choke", "units": "%"}),
+            "map_lift": ("map_lift", steady.lift, {"long_name": "gas lift", "units": "m3/h"}),
+        },
+        attrs={"long_name": "steady CV", "units": "cv_unit"},
+    )
+    return out | {"kind": of_each("mixed-integer"), "actuator": of_each("step")}
