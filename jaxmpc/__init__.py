@@ -3,7 +3,8 @@
 Importing the package switches JAX to float64: pruning integer decisions needs bounds that are right to
 1e-6, and float32 bounds are not. It also turns on JAX's persistent compilation cache, so that a second
 process starts without compiling; set ``JAX_COMPILATION_CACHE_DIR`` to move it or ``JAXMPC_NO_JIT_CACHE=1``
-to leave it off. The public names of its modules can be taken from the package itself.
+to leave it off. What compiles for more than a moment says so on standard error, unless ``JAXMPC_QUIET=1``.
+The public names of its modules can be taken from the package itself.
 """
 
 from jaxmpc.programs import interrupts as _interrupts
@@ -17,10 +18,12 @@ from importlib import import_module as _import_module
 import jax as _jax
 
 from jaxmpc.programs.cache import keep_programs as _keep_programs
+from jaxmpc.programs.compilation import watch as _watch
 
 _jax.config.update("jax_enable_x64", True)
 if not _os.environ.get("JAXMPC_NO_JIT_CACHE"):
     _keep_programs()
+_watch()
 
 _HOME_OF = {
     "ContinuousController": "controller.continuous",

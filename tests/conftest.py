@@ -1,5 +1,7 @@
 """Shared fixtures. Importing the package switches JAX to float64 and turns on the compilation cache."""
 
+import os
+
 import jax
 import numpy as np
 import pytest
@@ -8,6 +10,10 @@ import jaxmpc  # noqa: F401
 from jaxmpc.model.step_response import make_model
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import make_tuning
+
+os.environ["JAXMPC_QUIET"] = (
+    "1"  # what a test compiles depends on the tests before it; `test_compilation` listens
+)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -9,8 +9,9 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
-import sys
 from pathlib import Path
+
+from jaxmpc.programs.compilation import say
 
 SEAL = 64  # hexadecimal digits of a SHA-256
 
@@ -30,7 +31,7 @@ def cache_folder(kind: str) -> Path:
         return _private(_private(root) / kind)
     except (OSError, RuntimeError) as error:  # RuntimeError: there is no home directory
         root = _temporary()
-        _say(f"the cache is in {root}: {str(error).rstrip('.')}; JAXMPC_CACHE moves it")
+        say(f"the cache is in {root}: {str(error).rstrip('.')}; JAXMPC_CACHE moves it")
         os.environ["JAXMPC_CACHE"] = str(root)
         return _private(root / kind)
 
@@ -68,10 +69,6 @@ def _temporary() -> Path:
     return Path(tempfile.mkdtemp(prefix="jaxmpc-cache-"))
 
 
-def _say(line: str) -> None:
-    print(f"jaxmpc: {line}", file=sys.stderr)
-
-
 def sealed(archive: bytes) -> bytes:
     """A zip archive that ends, as its comment, in the SHA-256 of everything before.
 
@@ -103,7 +100,7 @@ def read_sealed(path: Path) -> bytes | None:
         reason = ""
     if hashlib.sha256(content[:-SEAL]).hexdigest().encode() == content[-SEAL:]:
         return content
-    _say(f"{path} is damaged{reason}; it is made anew")
+    say(f"{path} is damaged{reason}; it is made anew")
     with contextlib.suppress(OSError):
         path.unlink()
     return None
@@ -121,7 +118,7 @@ def keep_programs() -> None:
         try:
             jax.config.update("jax_compilation_cache_dir", str(cache_folder("jit")))
         except OSError as error:
-            _say(f"compiled programs are not kept: {error}")
+            say(f"compiled programs are not kept: {error}")
             return
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     # JAX has no public hook; without this function only the mending is missing.
@@ -146,7 +143,7 @@ def _mending(load):
             if not kept.is_file():
                 raise
             kept.unlink()
-            _say(f"{kept} is damaged ({type(error).__name__}); it is compiled anew")
+            say(f"{kept} is damaged ({type(error).__name__}); it is compiled anew")
             return None, None
 
     return mended
