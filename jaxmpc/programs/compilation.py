@@ -1,9 +1,9 @@
-"""Compilation is seen: one line on standard error for every pause in which programs are compiled, and a clock without it.
+"""Compilation is seen: one line on standard error for every pause in which programs are compiled, and clocks without it.
 
 A program of the core takes seconds to compile, in which nothing else can be seen. `watch` is called once, where the package
 is imported; from then on a timer runs beside every compilation and says so if it takes long. Programs that are loaded
 from the cache are not compiled, and those that are compiled in a moment end before the timer does. Who knows what the
-programs are for says so with `compiling_for`; the app takes the line with `told` to show it; bars measure with `clock`.
+programs are for says so with `compiling_for`; the app takes the line with `told` to show it; bars do not count its time.
 """
 
 from __future__ import annotations
@@ -173,3 +173,15 @@ def _entered(stack: list[Any], entry: Any) -> Iterator[None]:
 def clock() -> float:
     """Seconds that pass while nothing is compiled in this process; only differences mean anything."""
     return time.monotonic() - _compilation.seconds()
+
+
+def compiled_since() -> Callable[[], float]:
+    """A function that returns for how many seconds something was compiled since its last call, or since now."""
+    seen = _compilation.seconds()
+
+    def passed() -> float:
+        nonlocal seen
+        before, seen = seen, _compilation.seconds()
+        return seen - before
+
+    return passed

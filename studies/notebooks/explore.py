@@ -40,6 +40,35 @@ def _(mo):
 
 
 @app.cell
+def _(mo):
+    import contextlib
+    import queue
+
+    from jaxmpc.programs.compilation import compiled_since, told
+
+    @contextlib.contextmanager
+    def compilation_shown():
+        """Shows in its cell that something is compiled meanwhile; no threads but marimo's own reach the page."""
+        lines = queue.SimpleQueue()
+
+        def show():
+            for line in iter(lines.get, None):
+                mo.output.append(mo.md(line))
+
+        thread = mo.Thread(target=show)
+        thread.start()
+        try:
+            with told(lines.put):
+                yield
+        finally:
+            lines.put(None)
+            thread.join()
+            mo.output.clear()
+
+    return compilation_shown, compiled_since
+
+
+@app.cell
 def _(explore, mo, presets):
     controller = mo.ui.dropdown(list(explore.CONTROLLERS), value="mixed-integer")
     preset = mo.ui.dropdown(list(presets.TUNINGS), value="thesis")
@@ -136,6 +165,8 @@ def _(
     InputError,
     blocking,
     choke_weight,
+    compilation_shown,
+    compiled_since,
     controller,
     explore,
     gas_deadzone,
@@ -174,16 +205,21 @@ def _(
             whole=length.value,
         )
         if length.value:
-            with mo.status.progress_bar(total=7800, title="22 h", show_eta=True, remove_on_exit=True) as _bar:
-                _done = [0]
+            with (
+                compilation_shown(),
+                mo.status.progress_bar(total=7800, title="22 h", show_eta=True, remove_on_exit=True) as _bar,
+            ):
+                _done, _compiled = [0], compiled_since()
 
                 def _report(done, total):
+                    _bar.start_time += _compiled()
                     _bar.update(increment=done - _done[0])
                     _done[0] = done
 
                 run = explore.run(_settings, _report)
         else:
-            run = explore.run(_settings)
+            with compilation_shown():
+                run = explore.run(_settings)
     except InputError as error:
         refused = mo.callout(str(error), kind="warn")
     return refused, run
@@ -287,7 +323,7 @@ def _(chart, draw, mo, path):
 
 
 @app.cell
-def _(InputError, again, draw, mo, page, path, picked):
+def _(InputError, again, compilation_shown, draw, mo, page, path, picked):
     def _view():
         if picked is None:
             return mo.md("Pick a point to see its run.")
@@ -300,7 +336,7 @@ def _(InputError, again, draw, mo, page, path, picked):
                 from studies.notebooks.loop import RUN
                 from studies.run.rerun import rerun
 
-                with mo.status.spinner("running"):
+                with compilation_shown(), mo.status.spinner("running"):
                     found = rerun(Path(store), number)
                 data = run_results(found.trajectory, found.deadzone, found.kind, found.actuator)
                 data = data.assign_coords(controller=[RUN])

@@ -28,6 +28,7 @@ from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.tuning import Tuning
+from jaxmpc.programs.compilation import compiled_since
 from studies.definition.comparison import ComparisonDefinition, ControllerDefinition
 from studies.store.comparison import (
     FORMAT,
@@ -198,11 +199,16 @@ def run_controller(
 
 @contextlib.contextmanager
 def progress_bar(label: str, show: bool) -> Iterator[Callable[[int, int], None]]:
-    """A progress callback ``(done, total)`` that shows samples, rate and time left."""
+    """A progress callback ``(done, total)`` that shows samples, rate and time left, compilation not counted."""
     often = 0.5 if sys.stderr.isatty() else 10.0  # s; a log file needs no more
     with tqdm(desc=label, unit=" samples", disable=not show, dynamic_ncols=True, mininterval=often) as bar:
+        compiled = compiled_since()
 
         def report(done: int, total: int) -> None:
+            if show:
+                seconds = compiled()
+                bar.start_t += seconds
+                bar.last_print_t += seconds
             bar.total = total
             bar.update(done - bar.n)
 

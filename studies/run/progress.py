@@ -5,12 +5,12 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
-import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from tqdm import tqdm
 
+from jaxmpc.programs.compilation import clock
 from studies.run.estimate import Pace, Work, readable
 
 LAYOUT = "{l_bar}{bar}| {n_fmt}/{total_fmt} scenarios [{elapsed}{postfix}]"
@@ -22,7 +22,7 @@ class Progress:
     def __init__(self, bar: tqdm, pace: Pace):
         """Use `progress_bar`."""
         self._bar, self._pace = bar, pace
-        self._begin, self._scenarios = time.monotonic(), 0
+        self._begin, self._scenarios = clock(), 0
 
     def add(self, chunk: int, facts: Mapping[str, Any], scenarios: int, more: str = "") -> None:
         """A chunk was computed.
@@ -35,7 +35,7 @@ class Progress:
         """
         self._pace.add(chunk, facts)
         self._scenarios += scenarios
-        passed = max(time.monotonic() - self._begin, 1e-9)
+        passed = max(clock() - self._begin, 1e-9)
         words = [f"{self._scenarios / passed:.3g} per second", more]
         left = self._pace.left
         if not math.isnan(left) and left > 0:
@@ -68,5 +68,5 @@ def progress_bar(
         dynamic_ncols=True,
         mininterval=often,
     ) as bar:
-        bar.set_postfix_str("time left is known after the first chunk")
+        bar.set_postfix_str("compiles what is new to this machine; time left is known after the first chunk")
         yield Progress(bar, Pace(work, done))

@@ -454,6 +454,43 @@ def test_a_websocket_is_refused_without_the_token_and_to_other_sites(address):
     assert "kernel-ready" in listen(address, token, {})
 
 
+SLOW = """
+import time
+from jax._src import compiler
+
+def slowly(*arguments, real=compiler.backend_compile_and_load, waits=[1.3], **options):
+    time.sleep(waits.pop() if waits else 0.0)
+    return real(*arguments, **options)
+
+compiler.backend_compile_and_load = slowly  # a machine that is slow with its first program
+"""
+
+
+@SERVED
+def test_the_page_shows_that_programs_are_compiled_until_they_are(tmp_path):
+    client = pytest.importorskip("websockets.sync.client")
+    (tmp_path / "sitecustomize.py").write_text(SLOW)
+    found, more = os.environ.get("PYTHONPATH", ""), {"JAXMPC_QUIET": ""}
+    with serving(tmp_path / "log", "--headless", PYTHONPATH=f"{tmp_path}{os.pathsep}{found}", **more) as (
+        _,
+        at,
+    ):
+        at = urlsplit(at)
+        uri = f"ws://127.0.0.1:{at.port}/ws?session_id=s_{os.urandom(4).hex()}&{at.query}"
+        shown, cell = [], None  # outputs of the cell that has said so
+        with client.connect(uri, proxy=None, max_size=None) as page:
+            while not shown or "compiling" in shown[-1]:
+                said = json.loads(page.recv(300))
+                output = said["data"].get("output") if said["op"] == "cell-op" else None
+                if output and ("compiling" in output["data"] or said["data"]["cell_id"] == cell):
+                    cell = said["data"]["cell_id"]
+                    shown.append(output["data"])
+    assert len(shown) == 2
+    assert "compiling; once per machine" in shown[0]
+    assert "compiling" not in shown[1]
+    assert (tmp_path / "log").read_text() == ""
+
+
 @SERVED
 def test_the_app_is_served_on_the_loopback_interface_only_and_ends_with_its_process(tmp_path):
     for number, status in ((signal.SIGINT, 130), (signal.SIGTERM, -signal.SIGTERM), (signal.SIGKILL, -9)):
