@@ -1,6 +1,7 @@
 """Serves the interactive app to one user on this machine; the command ``jaxmpc explore`` calls it.
 
-The server is part of this process, so that it ends with it however that happens. Its address holds a token, see `guard`.
+The server is part of this process, so that it ends with it however that happens; and the process ends with the one that has
+started it, or else it would go on where nobody can stop it. Its address holds a token, see `guard`.
 """
 
 from __future__ import annotations
@@ -11,11 +12,12 @@ import importlib.util
 import os
 import secrets
 import shutil
+import signal
 import socket
 import tempfile
 import threading
 import webbrowser
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +27,13 @@ from studies.notebooks.guard import TOKEN, Guard
 
 APP = Path(__file__).with_name("explore.py")
 LOOPBACK = "127.0.0.1"
+LOOK = 1.0  # s between looks at who has started this process
 
 
 def explore(port: int | None = None, headless: bool = False, store: str | Path | None = None) -> int:
     """Serve the app on this machine until it is stopped; its address is printed.
+
+    It also ends with the process that has started this one, unless a closed terminal is ignored (``nohup``).
 
     Args:
         port: of the page; a free one if not given.
@@ -36,7 +41,7 @@ def explore(port: int | None = None, headless: bool = False, store: str | Path |
         store: study store that the second page opens.
 
     Returns:
-        1 where the server has ended by itself.
+        1 where the server has ended by itself, or nobody is left who could stop it.
 
     Raises:
         InputError: for a port that does not exist or is in use, or a store that is not there; before anything is served.
@@ -49,6 +54,7 @@ def explore(port: int | None = None, headless: bool = False, store: str | Path |
     for tool in ("marimo", "altair"):
         if importlib.util.find_spec(tool) is None:
             raise MissingToolError(f"The app needs {tool}: pip install 'jaxmpc[notebook]'")
+    parent = os.getppid()
     with _listen(port) as listening, _letter(headless) as letter:
         token, own_port = secrets.token_urlsafe(32), listening.getsockname()[1]
         address = f"http://{LOOPBACK}:{own_port}/?{TOKEN}={token}"
@@ -56,7 +62,7 @@ def explore(port: int | None = None, headless: bool = False, store: str | Path |
         serving = _serve(Guard(_app(), own_port, token, meta, entered=letter.close), listening)
         print(f"jaxmpc: {address}", flush=True)
         letter.send(address)
-        serving.join()
+        _wait(serving, parent)
     return 1
 
 
@@ -87,6 +93,17 @@ def _serve(app: Guard, listening: socket.socket) -> threading.Thread:
     return thread
 
 
+def _wait(serving: threading.Thread, parent: int) -> None:
+    """Until the server has ended, or whoever has started this process."""
+    while serving.is_alive() and (os.getppid() == parent or _goes_on()):
+        serving.join(LOOK)
+
+
+def _goes_on() -> bool:
+    """Whether this process was told to outlive its terminal."""
+    return hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+
+
 class _Letter:
     """Hands the address to the browser in a file of this user, as others can read the arguments of a program."""
 
@@ -114,5 +131,26 @@ def _letter(headless: bool) -> Iterator[_Letter]:
     home = os.path.expanduser("~")
     place = home if os.access(home, os.W_OK) else None
     letter = _Letter(None if headless else Path(tempfile.mkdtemp(prefix="jaxmpc-explore-", dir=place)))
-    with in_the_end(letter.close):
+    with in_the_end(letter.close), _before_a_signal(letter.close):
         yield letter
+
+
+@contextlib.contextmanager
+def _before_a_signal(remove: Callable[[], object]) -> Iterator[None]:
+    """Remove something also where a signal ends this process, as closing its terminal does."""
+
+    def end(number: int, _: object) -> None:
+        remove()
+        signal.signal(number, signal.SIG_DFL)
+        os.kill(os.getpid(), number)
+
+    here = threading.current_thread() is threading.main_thread()
+    names = [name for name in ("SIGTERM", "SIGHUP") if here and hasattr(signal, name)]
+    numbers = [n for n in (getattr(signal, name) for name in names) if signal.getsignal(n) is signal.SIG_DFL]
+    for number in numbers:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number in numbers:
+            signal.signal(number, signal.SIG_DFL)

@@ -507,6 +507,78 @@ def test_the_app_is_served_on_the_loopback_interface_only_and_ends_with_its_proc
         assert log.read_text() == ("jaxmpc: stopped\n" if number == signal.SIGINT else "")
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no terminals as on POSIX")
+@SERVED
+@pytest.mark.parametrize("goes_on", [False, True], ids=["", "nohup"])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL], ids=["terminated", "killed"])
+def test_the_server_ends_with_the_process_that_has_started_it_unless_it_is_told_to_go_on(
+    number, goes_on, tmp_path
+):
+    ignoring = "trap '' HUP; " if goes_on else ""
+    command = f'{ignoring}"{sys.executable}" -m jaxmpc.cli explore --headless & echo $!; wait'
+    shell = subprocess.Popen(["sh", "-c", command], stdout=subprocess.PIPE, text=True, start_new_session=True)
+    pid = int(shell.stdout.readline())
+    try:
+        port = urlsplit(shell.stdout.readline().split()[1]).port
+        os.kill(shell.pid, number)  # this process alone
+        shell.wait(60)
+        if goes_on:
+            time.sleep(3 * launch.LOOK)
+            assert is_served(port)
+        else:
+            until(lambda: not is_served(port), 60)
+            until(lambda: not is_running(pid), 60)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+        shell.stdout.close()
+
+
+def is_served(port):
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def is_running(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    state = Path(f"/proc/{pid}/stat")  # a container may have nobody who asks for the status of orphans
+    return not state.exists() or state.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no terminals as on POSIX")
+@SERVED
+def test_the_server_ends_with_its_terminal_and_leaves_no_address_behind(tmp_path):
+    import pty
+
+    home, browser = tmp_path / "home", tmp_path / "browser"
+    home.mkdir()
+    browser.write_text("#!/bin/sh\nexec sleep 600\n")  # does not read its page
+    browser.chmod(0o755)
+    owns = "import fcntl, os, sys, termios; fcntl.ioctl(1, termios.TIOCSCTTY, 0); os.execv(sys.argv[1], sys.argv[1:])"
+    terminal, inner = pty.openpty()
+    server = subprocess.Popen(
+        [sys.executable, "-c", owns, sys.executable, "-m", "jaxmpc.cli", "explore"],
+        env={**os.environ, "HOME": str(home), "BROWSER": str(browser)},
+        stdin=inner,
+        stdout=inner,
+        stderr=inner,
+        start_new_session=True,
+    )
+    os.close(inner)
+    said = b""
+    while not said.endswith(b"\n"):
+        said += os.read(terminal, 1000)
+    port = urlsplit(said.decode().split()[1]).port
+    until(lambda: list(home.glob("jaxmpc-*/open.html")))
+    os.close(terminal)
+    assert server.wait(60) == -signal.SIGHUP
+    assert not is_served(port)
+    assert list(home.glob("jaxmpc-*")) == []
+
+
 @SERVED
 def test_a_port_that_is_in_use_is_refused_before_anything_is_served(capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
