@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxmpc.cli.options import COMPARISONS, parser
-from jaxmpc.errors import InputError, MissingToolError, PlantError
+from jaxmpc.errors import InputError, MissingToolError, PlantError, near
 from jaxmpc.files import check_folder, check_target, write_atomically
 from jaxmpc.programs import interrupts
 
@@ -266,7 +266,6 @@ def _study_sweep(options: argparse.Namespace, given: dict[str, Any]) -> int:
 
 def _refused(error: InputError, study: str) -> InputError:
     """The error of a definition with what the command line can do about it."""
-    from studies.definition.fields import near
     from studies.definition.sweep import shipped_studies
 
     if error.field == "study.confirmation_limit":

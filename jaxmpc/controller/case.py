@@ -12,17 +12,18 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import re
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from jaxmpc.decoding import decode
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
 from jaxmpc.model.step_response import StepResponseModel, make_model
 from jaxmpc.problem.condense import DRIFT
+from jaxmpc.problem.declared import declared
 from jaxmpc.problem.structure import LARGEST, Structure, sound
 from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.problem.tuning import Tuning, make_tuning
@@ -109,50 +110,25 @@ class _CaseFields(msgspec.Struct, forbid_unknown_fields=True):
     limits: _LimitFields | None = None
 
 
-_ARRAYS = ("mv_now", "last_move", "free_response", "setpoint", "previous_moves")
+_ARRAYS = {  # unit, names of the columns, number of rows and what that is
+    "mv_now": ("MV unit", "mv_names", "", ""),
+    "last_move": ("MV unit", "mv_names", "", ""),
+    "free_response": ("CV unit", "cv_names", "prediction_horizon", "prediction_horizon"),
+    "setpoint": ("CV unit", "cv_names", "prediction_horizon", "prediction_horizon"),
+    "previous_moves": ("MV unit per sample", "mv_names", "block_count", "the number of blocks"),
+}
 _PLAN = (
     *("status", "objective", "bound", "gap", "moves", "mv", "cv", "eps_high", "eps_low"),
     *("nodes", "solve_time_s", "finished_by"),
 )
-
-
-class _Nothing:
-    def __repr__(self):
-        return "nothing"
-
-
-_FIELDS = {
-    "": _CaseFields,
-    "model": _ModelFields,
-    "structure": _StructureFields,
-    "tuning": _TuningFields,
-    "limits": _LimitFields,
-}
 _UNIT = {
     "model.dt": "s",
     "model.coefficients": "CV unit per MV unit",
-    "structure.prediction_horizon": "samples",
-    "structure.control_horizon": "samples",
-    "structure.first_penalised": "samples",
-    "structure.blocks": "samples",
-    "mv_now": "MV unit",
-    "last_move": "MV unit",
-    "free_response": "CV unit",
-    "setpoint": "CV unit",
-    "previous_moves": "MV unit per sample",
     "limits.time_s": "s",
     "limits.gap": "relative",
+    **{f"structure.{key}": field.unit for key, field in declared(Structure).items()},
     **{f"tuning.{key}": field.unit for key, field in _IN_STEP.items()},
-}
-_KIND = {
-    "float": "a number",
-    "float | null": "a number (or null for none)",
-    "int": "a whole number",
-    "str": "text in quotes",
-    "array": "a list",
-    "array | null": "a list",
-    "object": "an object {...}",
-    "object | null": "an object {...}",
+    **{key: unit for key, (unit, *_) in _ARRAYS.items()},
 }
 
 
@@ -195,23 +171,16 @@ def make_case(body: Any) -> Case:
         InputError: naming the path of the field, for unknown or missing fields, wrong types (true and false
             are not numbers), wrong shapes, NaN, crossed limits, and whatever else makes the step meaningless.
     """
-    fields = _decode(body)
+    told = lambda path, words: words + _unit(path)  # noqa: E731
+    fields = decode(body, _CaseFields, name="case", table="an object {...}", expected=told)
     model = make_model(fields.model.coefficients, fields.model.dt, fields.model.cv, fields.model.mv)
     structure = _structure(fields.structure, model)
-    tuning = make_tuning(structure, **{key: getattr(fields.tuning, key) for key in _IN_STEP})
-    rows = structure.prediction_horizon
-    horizon = rows, f"prediction_horizon = {rows}"
-    blocks = structure.block_count, f"the number of blocks = {structure.block_count}"
-    limits, moves = fields.limits or _LimitFields(), fields.previous_moves
+    limits = fields.limits or _LimitFields()
     case = Case(
         model=model,
         structure=structure,
-        tuning=tuning,
-        mv_now=_array("mv_now", fields.mv_now, model.mv_names),
-        last_move=_array("last_move", fields.last_move, model.mv_names),
-        free_response=_array("free_response", fields.free_response, model.cv_names, horizon),
-        setpoint=_array("setpoint", fields.setpoint, model.cv_names, horizon),
-        previous_moves=None if moves is None else _array("previous_moves", moves, model.mv_names, blocks),
+        tuning=make_tuning(structure, **{key: getattr(fields.tuning, key) for key in _IN_STEP}),
+        **{key: _array(key, getattr(fields, key), structure) for key in _ARRAYS},
         time_limit=check_time_limit("limits.time_s", limits.time_s),
         gap=check_gap("limits.gap", limits.gap),
     )
@@ -238,7 +207,7 @@ def case_to_dict(case: Case) -> dict[str, Any]:
             "coefficients": np.asarray(model.coefficients).tolist(),
         },
         "structure": {
-            **{key: getattr(structure, key) for key in _names(_StructureFields)},
+            **{key: getattr(structure, key) for key in _StructureFields.__struct_fields__},
             "blocks": list(structure.blocks),
             "integer_step": {structure.mv_names[i]: structure.integer_step[i] for i in structure.integer_mvs},
         },
@@ -272,10 +241,6 @@ def _plain(value: Any) -> Any:
     return _plain(np.asarray(value).tolist())
 
 
-def _names(fields: type[msgspec.Struct]) -> tuple[str, ...]:
-    return fields.__struct_fields__
-
-
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """A JSON object; a repeated key would silently drop the first value."""
     body = dict(pairs)
@@ -286,42 +251,8 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return body
 
 
-def _decode(body: Any) -> _CaseFields:
-    """The typed fields, or an InputError with the path that msgspec found."""
-    try:
-        return msgspec.convert(body, _CaseFields)
-    except msgspec.ValidationError as error:
-        message, _, where = str(error).partition(" - at `$")
-        path = where.rstrip("`").lstrip(".")
-        value = _at(body, path)
-        if found := re.search(r"unknown field `(.*)`", message):
-            names = _names(_FIELDS[path])
-            raise InputError(
-                _join(path, found[1]), value[found[1]], f"no such field, only {', '.join(names)}"
-            ) from None
-        if found := re.search(r"missing required field `(.*)`", message):
-            expected = f"a value (the field is missing){_unit(_join(path, found[1]))}"
-            raise InputError(_join(path, found[1]), _Nothing(), expected) from None
-        found = re.match(r"Expected `(.*)`, got", message)
-        kind = _KIND.get(found[1], found[1]) if found else f"a finite number ({message})"
-        raise InputError(path or "case", value, kind + _unit(path)) from None
-
-
-def _at(body: Any, path: str) -> Any:
-    """The value at a path such as ``tuning.cv_weight[1]``."""
-    for name, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", path):
-        body = body[name] if name else body[int(index)]
-    return body
-
-
-def _join(path: str, name: str) -> str:
-    name = name or '""'
-    return f"{path}.{name}" if path else name
-
-
 def _unit(path: str) -> str:
-    unit = _UNIT.get(re.sub(r"\[\d+\]", "", path))
-    return f" [{unit}]" if unit else ""
+    return f" [{_UNIT[path]}]" if _UNIT.get(path) else ""
 
 
 def _structure(fields: _StructureFields, model: StepResponseModel) -> Structure:
@@ -349,17 +280,19 @@ def _structure(fields: _StructureFields, model: StepResponseModel) -> Structure:
     )
 
 
-def _array(
-    path: str, given: list[Any], names: tuple[str, ...], rows: tuple[int, str] | None = None
-) -> np.ndarray:
-    """A finite vector with one entry per name; with `rows`, a matrix of exactly that many such rows (and why so many)."""
+def _array(path: str, given: list[Any] | None, structure: Structure) -> Any:
+    """A finite vector with one entry per name, or a matrix of such rows, as many as it must have; None as it is."""
+    if given is None:
+        return None
+    _, columns, count, why = _ARRAYS[path]
+    names = getattr(structure, columns)
     numbers = f"{len(names)} numbers{_unit(path)}"
-    if rows is not None and len(given) != rows[0]:
-        raise InputError(path, f"{len(given)} rows", f"{rows[1]} rows of {numbers}")
-    for i, row in enumerate([given] if rows is None else given):
+    if count and len(given) != getattr(structure, count):
+        expected = f"{why} = {getattr(structure, count)} rows of {numbers}"
+        raise InputError(path, f"{len(given)} rows", expected)
+    for i, row in enumerate(given if count else [given]):
         if len(row) != len(names):
-            at = path if rows is None else f"{path}[{i}]"
-            raise InputError(at, row, f"{numbers} for {', '.join(names)}")
+            raise InputError(f"{path}[{i}]" if count else path, row, f"{numbers} for {', '.join(names)}")
     array = np.array(given, dtype=np.float64)
     bad = np.argwhere(~sound(array))
     if len(bad):

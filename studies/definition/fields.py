@@ -7,14 +7,13 @@ the definition is checked against it, axes take their units and labels from it, 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 from decimal import Decimal
 from typing import Any, Literal
 
 import numpy as np
 
-from jaxmpc.errors import InputError
+from jaxmpc.errors import InputError, near
 from jaxmpc.problem.declared import LARGEST, declared
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS as TUNING
@@ -133,12 +132,6 @@ def as_text(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     return value if isinstance(value, str) else " ".join(str(v) for v in value)
-
-
-def near(given: Any, known) -> str:
-    """``Did you mean ...?`` for the closest known names; empty where none is close."""
-    found = difflib.get_close_matches(str(given), list(known), n=3, cutoff=0.6)
-    return f"Did you mean {' or '.join(found)}?" if found else ""
 
 
 # -------------------------------------------------------------------------------------------------------- the well
