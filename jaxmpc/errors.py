@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class InputError(ValueError):
     """Bad input, refused before anything is computed or overwritten.
@@ -30,3 +33,9 @@ class MissingToolError(RuntimeError):
 
 class PlantError(RuntimeError):
     """A plant has failed while it ran, for example an FMU that crashed; the message says which one, how and when."""
+
+
+def near(given: object, known: Iterable[str]) -> str:
+    """``Did you mean ...?`` for the closest known names; empty where none is close."""
+    found = difflib.get_close_matches(str(given), list(known), n=3, cutoff=0.6)
+    return f"Did you mean {' or '.join(found)}?" if found else ""

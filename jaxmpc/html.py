@@ -184,20 +184,19 @@ def step_response(model: Any) -> str:
     return card("Step-response model", facts(known), table(head, rows), note)
 
 
-def tuning(values: Any, units: Mapping[str, str], defaults: Mapping[str, Any]) -> str:
-    """A `jaxmpc.problem.tuning.Tuning`: value, unit and default of each field.
+def fields(title: str, values: Any, declared: Mapping[str, Any]) -> str:
+    """What an object of declared fields holds: value, unit, default and meaning of each.
 
     Args:
-        values: the tuning.
-        units: by field.
-        defaults: by field; what is not in it has none.
+        title: of the table.
+        values: the object.
+        declared: a `jaxmpc.problem.declared.Declared` per field.
     """
     rows = []
-    for field in dataclasses.fields(values):
-        value = getattr(values, field.name)
-        default = number(defaults[field.name]) if field.name in defaults else "required"
-        rows.append([field.name.replace("_", " "), number(value), units.get(field.name, ""), default])
-    return card("Tuning", table(["field", "value", "unit", "default"], rows))
+    for key, field in declared.items():
+        default = "required" if field.default is None else number(field.default)
+        rows.append([key.replace("_", " "), number(getattr(values, key)), field.unit, default, field.text])
+    return card(title, table(["field", "value", "unit", "default", "meaning"], rows))
 
 
 def plan(solved: Any) -> str:

@@ -12,19 +12,21 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import re
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from jaxmpc.decoding import decode
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
 from jaxmpc.model.step_response import StepResponseModel, make_model
 from jaxmpc.problem.condense import DRIFT
+from jaxmpc.problem.declared import declared
 from jaxmpc.problem.structure import LARGEST, Structure, sound
-from jaxmpc.problem.tuning import UNITS, Tuning, make_tuning
+from jaxmpc.problem.tuning import FIELDS as TUNING
+from jaxmpc.problem.tuning import Tuning, make_tuning
 from jaxmpc.relaxed.gap import check_gap, check_time_limit
 
 DEFAULT_GAP = 1e-6
@@ -77,20 +79,18 @@ class _StructureFields(msgspec.Struct, forbid_unknown_fields=True):
     integer_step: dict[str, Any] = {}
 
 
-class _TuningFields(msgspec.Struct, forbid_unknown_fields=True):
-    cv_weight: list[float]
-    move_weight: list[float]
-    soft_quadratic: list[float]
-    soft_linear: list[float]
-    deadzone: list[float]
-    cv_low: list[float | None]
-    cv_high: list[float | None]
-    slack_weight: list[float]
-    mv_low: list[float | None]
-    mv_high: list[float | None]
-    move_low: list[float | None]
-    move_high: list[float | None]
-    oscillation_rows: dict[str, Any] = {}
+_IN_STEP = {key: field for key, field in TUNING.items() if field.in_step}
+_TuningFields: Any = msgspec.defstruct(
+    "_TuningFields",
+    [
+        (key, dict[str, Any], {})
+        if field.flag
+        else (key, list[float | None] if field.infinite else list[float])
+        for key, field in _IN_STEP.items()
+    ],
+    forbid_unknown_fields=True,
+    kw_only=True,
+)
 
 
 class _LimitFields(msgspec.Struct, forbid_unknown_fields=True):
@@ -101,7 +101,7 @@ class _LimitFields(msgspec.Struct, forbid_unknown_fields=True):
 class _CaseFields(msgspec.Struct, forbid_unknown_fields=True):
     model: _ModelFields
     structure: _StructureFields
-    tuning: _TuningFields
+    tuning: _TuningFields  # pyright: ignore[reportInvalidTypeForm]
     mv_now: list[float]
     last_move: list[float]
     free_response: list[list[float]]
@@ -110,43 +110,25 @@ class _CaseFields(msgspec.Struct, forbid_unknown_fields=True):
     limits: _LimitFields | None = None
 
 
-class _Nothing:
-    def __repr__(self):
-        return "nothing"
-
-
-_FIELDS = {
-    "": _CaseFields,
-    "model": _ModelFields,
-    "structure": _StructureFields,
-    "tuning": _TuningFields,
-    "limits": _LimitFields,
+_ARRAYS = {  # unit, names of the columns, number of rows and what that is
+    "mv_now": ("MV unit", "mv_names", "", ""),
+    "last_move": ("MV unit", "mv_names", "", ""),
+    "free_response": ("CV unit", "cv_names", "prediction_horizon", "prediction_horizon"),
+    "setpoint": ("CV unit", "cv_names", "prediction_horizon", "prediction_horizon"),
+    "previous_moves": ("MV unit per sample", "mv_names", "block_count", "the number of blocks"),
 }
+_PLAN = (
+    *("status", "objective", "bound", "gap", "moves", "mv", "cv", "eps_high", "eps_low"),
+    *("nodes", "solve_time_s", "finished_by"),
+)
 _UNIT = {
     "model.dt": "s",
     "model.coefficients": "CV unit per MV unit",
-    "structure.prediction_horizon": "samples",
-    "structure.control_horizon": "samples",
-    "structure.first_penalised": "samples",
-    "structure.blocks": "samples",
-    "mv_now": "MV unit",
-    "last_move": "MV unit",
-    "free_response": "CV unit",
-    "setpoint": "CV unit",
-    "previous_moves": "MV unit per sample",
     "limits.time_s": "s",
     "limits.gap": "relative",
-    **{f"tuning.{key}": unit for key, unit in UNITS.items()},
-}
-_KIND = {
-    "float": "a number",
-    "float | null": "a number (or null for none)",
-    "int": "a whole number",
-    "str": "text in quotes",
-    "array": "a list",
-    "array | null": "a list",
-    "object": "an object {...}",
-    "object | null": "an object {...}",
+    **{f"structure.{key}": field.unit for key, field in declared(Structure).items()},
+    **{f"tuning.{key}": field.unit for key, field in _IN_STEP.items()},
+    **{key: unit for key, (unit, *_) in _ARRAYS.items()},
 }
 
 
@@ -189,31 +171,18 @@ def make_case(body: Any) -> Case:
         InputError: naming the path of the field, for unknown or missing fields, wrong types (true and false
             are not numbers), wrong shapes, NaN, crossed limits, and whatever else makes the step meaningless.
     """
-    fields = _decode(body)
+    told = lambda path, words: words + _unit(path)  # noqa: E731
+    fields = decode(body, _CaseFields, name="case", table="an object {...}", expected=told)
     model = make_model(fields.model.coefficients, fields.model.dt, fields.model.cv, fields.model.mv)
     structure = _structure(fields.structure, model)
-    tuning = make_tuning(structure, **{key: getattr(fields.tuning, key) for key in _names(_TuningFields)})
-    horizon = f"prediction_horizon = {structure.prediction_horizon}"
+    limits = fields.limits or _LimitFields()
     case = Case(
         model=model,
         structure=structure,
-        tuning=tuning,
-        mv_now=_row("mv_now", fields.mv_now, model.mv_names),
-        last_move=_row("last_move", fields.last_move, model.mv_names),
-        free_response=_table(
-            "free_response", fields.free_response, structure.prediction_horizon, horizon, model.cv_names
-        ),
-        setpoint=_table("setpoint", fields.setpoint, structure.prediction_horizon, horizon, model.cv_names),
-        previous_moves=None
-        if fields.previous_moves is None
-        else _table(
-            "previous_moves",
-            fields.previous_moves,
-            structure.block_count,
-            f"the number of blocks = {structure.block_count}",
-            model.mv_names,
-        ),
-        **_limits(fields.limits or _LimitFields()),
+        tuning=make_tuning(structure, **{key: getattr(fields.tuning, key) for key in _IN_STEP}),
+        **{key: _array(key, getattr(fields, key), structure) for key in _ARRAYS},
+        time_limit=check_time_limit("limits.time_s", limits.time_s),
+        gap=check_gap("limits.gap", limits.gap),
     )
     _check_position(case)
     return case
@@ -225,8 +194,12 @@ def case_to_dict(case: Case) -> dict[str, Any]:
     The bias filter and the mean-move limit are the controller's memory, not part of one step: a caller that
     logs a step passes the move limits that held in that step.
     """
-    structure, tuning, model = case.structure, case.tuning, case.model
-    body: dict[str, Any] = {
+    structure, model = case.structure, case.model
+    tuning = {key: np.asarray(getattr(case.tuning, key)).tolist() for key in _IN_STEP}
+    for key, field in _IN_STEP.items():
+        if field.flag:
+            tuning[key] = {structure.mv_names[i]: tuning[key][i] for i in structure.integer_mvs}
+    body = {
         "model": {
             "dt": model.dt,
             "cv": list(model.cv_names),
@@ -234,31 +207,14 @@ def case_to_dict(case: Case) -> dict[str, Any]:
             "coefficients": np.asarray(model.coefficients).tolist(),
         },
         "structure": {
-            "prediction_horizon": structure.prediction_horizon,
-            "control_horizon": structure.control_horizon,
-            "first_penalised": structure.first_penalised,
+            **{key: getattr(structure, key) for key in _StructureFields.__struct_fields__},
             "blocks": list(structure.blocks),
-            "blocking": structure.blocking,
             "integer_step": {structure.mv_names[i]: structure.integer_step[i] for i in structure.integer_mvs},
         },
-        "tuning": {
-            key: [
-                value if math.isfinite(value) else None for value in np.asarray(getattr(tuning, key)).tolist()
-            ]
-            for key in _names(_TuningFields)
-            if key != "oscillation_rows"
-        },
-        "mv_now": np.asarray(case.mv_now).tolist(),
-        "last_move": np.asarray(case.last_move).tolist(),
-        "free_response": np.asarray(case.free_response).tolist(),
-        "setpoint": np.asarray(case.setpoint).tolist(),
+        "tuning": _plain(tuning),
+        **{key: np.asarray(getattr(case, key)).tolist() for key in _ARRAYS if getattr(case, key) is not None},
+        "limits": {"time_s": case.time_limit, "gap": case.gap},
     }
-    body["tuning"]["oscillation_rows"] = {
-        structure.mv_names[i]: bool(tuning.oscillation_rows[i]) for i in structure.integer_mvs
-    }
-    if case.previous_moves is not None:
-        body["previous_moves"] = np.asarray(case.previous_moves).tolist()
-    body["limits"] = {"time_s": case.time_limit, "gap": case.gap}
     return body
 
 
@@ -269,33 +225,20 @@ def dump_case(case: Case, path: str | Path) -> Path:
 
 def plan_to_dict(plan: Any) -> dict[str, Any]:
     """The content of a plan file: the fields of a `Plan`, with null where a number is not finite."""
-    return {
-        "status": str(plan.status),
-        "objective": _plain(plan.objective),
-        "bound": _plain(plan.bound),
-        "gap": _plain(plan.gap),
-        "moves": _plain(plan.moves),
-        "mv": _plain(plan.mv),
-        "cv": _plain(plan.cv),
-        "eps_high": _plain(plan.eps_high),
-        "eps_low": _plain(plan.eps_low),
-        "nodes": _plain(plan.nodes),
-        "solve_time_s": _plain(plan.solve_time_s),
-        "finished_by": None if plan.finished_by is None else str(plan.finished_by),
-    }
+    return {name: _plain(getattr(plan, name)) for name in _PLAN}
 
 
 def _plain(value: Any) -> Any:
     """Arrays and numbers as JSON values; JSON has no NaN and no infinity."""
-    if value is None or isinstance(value, (int, float)):
-        return value if value is None or math.isfinite(value) else None
+    if value is None or isinstance(value, str):
+        return value
+    if isinstance(value, (int, float)):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
     if isinstance(value, list):
         return [_plain(entry) for entry in value]
     return _plain(np.asarray(value).tolist())
-
-
-def _names(fields: type[msgspec.Struct]) -> tuple[str, ...]:
-    return fields.__struct_fields__
 
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -308,42 +251,8 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return body
 
 
-def _decode(body: Any) -> _CaseFields:
-    """The typed fields, or an InputError with the path that msgspec found."""
-    try:
-        return msgspec.convert(body, _CaseFields)
-    except msgspec.ValidationError as error:
-        message, _, where = str(error).partition(" - at `$")
-        path = where.rstrip("`").lstrip(".")
-        value = _at(body, path)
-        if found := re.search(r"unknown field `(.*)`", message):
-            names = _names(_FIELDS[path])
-            raise InputError(
-                _join(path, found[1]), value[found[1]], f"no such field, only {', '.join(names)}"
-            ) from None
-        if found := re.search(r"missing required field `(.*)`", message):
-            expected = f"a value (the field is missing){_unit(_join(path, found[1]))}"
-            raise InputError(_join(path, found[1]), _Nothing(), expected) from None
-        found = re.match(r"Expected `(.*)`, got", message)
-        kind = _KIND.get(found[1], found[1]) if found else f"a finite number ({message})"
-        raise InputError(path or "case", value, kind + _unit(path)) from None
-
-
-def _at(body: Any, path: str) -> Any:
-    """The value at a path such as ``tuning.cv_weight[1]``."""
-    for name, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", path):
-        body = body[name] if name else body[int(index)]
-    return body
-
-
-def _join(path: str, name: str) -> str:
-    name = name or '""'
-    return f"{path}.{name}" if path else name
-
-
 def _unit(path: str) -> str:
-    unit = _UNIT.get(re.sub(r"\[\d+\]", "", path))
-    return f" [{unit}]" if unit else ""
+    return f" [{_UNIT[path]}]" if _UNIT.get(path) else ""
 
 
 def _structure(fields: _StructureFields, model: StepResponseModel) -> Structure:
@@ -371,24 +280,20 @@ def _structure(fields: _StructureFields, model: StepResponseModel) -> Structure:
     )
 
 
-def _row(path: str, given: list[float], names: tuple[str, ...]) -> np.ndarray:
-    """A finite vector with one entry per name."""
-    if len(given) != len(names):
-        raise InputError(path, given, f"{len(names)} numbers{_unit(path)} for {', '.join(names)}")
-    return _finite(path, np.array(given, dtype=np.float64))
-
-
-def _table(path: str, given: list[list[float]], rows: int, why: str, names: tuple[str, ...]) -> np.ndarray:
-    """A finite matrix of exactly `rows` rows with one column per name."""
-    if len(given) != rows:
-        raise InputError(path, f"{len(given)} rows", f"{why} rows of {len(names)} numbers{_unit(path)}")
-    for i, row in enumerate(given):
+def _array(path: str, given: list[Any] | None, structure: Structure) -> Any:
+    """A finite vector with one entry per name, or a matrix of such rows, as many as it must have; None as it is."""
+    if given is None:
+        return None
+    _, columns, count, why = _ARRAYS[path]
+    names = getattr(structure, columns)
+    numbers = f"{len(names)} numbers{_unit(path)}"
+    if count and len(given) != getattr(structure, count):
+        expected = f"{why} = {getattr(structure, count)} rows of {numbers}"
+        raise InputError(path, f"{len(given)} rows", expected)
+    for i, row in enumerate(given if count else [given]):
         if len(row) != len(names):
-            raise InputError(f"{path}[{i}]", row, f"{len(names)} numbers{_unit(path)} for {', '.join(names)}")
-    return _finite(path, np.array(given, dtype=np.float64))
-
-
-def _finite(path: str, array: np.ndarray) -> np.ndarray:
+            raise InputError(f"{path}[{i}]" if count else path, row, f"{numbers} for {', '.join(names)}")
+    array = np.array(given, dtype=np.float64)
     bad = np.argwhere(~sound(array))
     if len(bad):
         index = "".join(f"[{i}]" for i in bad[0])
@@ -396,13 +301,6 @@ def _finite(path: str, array: np.ndarray) -> np.ndarray:
         raise InputError(path + index, float(array[tuple(bad[0])]), expected)
     array.setflags(write=False)
     return array
-
-
-def _limits(fields: _LimitFields) -> dict[str, Any]:
-    return {
-        "time_limit": check_time_limit("limits.time_s", fields.time_s),
-        "gap": check_gap("limits.gap", fields.gap),
-    }
 
 
 def _check_position(case: Case) -> None:

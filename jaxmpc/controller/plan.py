@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from jaxmpc import html
 from jaxmpc import status as codes
@@ -126,12 +127,12 @@ class Planner:
     def solve(
         self,
         *,
-        mv_now,
-        last_move,
-        free_response,
-        setpoint,
-        previous_moves=None,
-        past_moves=None,
+        mv_now: Float[ArrayLike, " mv"],
+        last_move: Float[ArrayLike, " mv"],
+        free_response: Float[ArrayLike, "horizon cv"],
+        setpoint: Float[ArrayLike, "horizon cv"],
+        previous_moves: Float[ArrayLike, "block mv"] | None = None,
+        past_moves: Float[ArrayLike, "window mv"] | None = None,
         recover: bool = False,
         warm: WarmStart | None = None,
         time_limit: float | None = None,
@@ -325,11 +326,11 @@ def solve_plan(
     structure: Structure,
     tuning: Tuning,
     *,
-    mv_now,
-    last_move,
-    free_response,
-    setpoint,
-    previous_moves=None,
+    mv_now: Float[ArrayLike, " mv"],
+    last_move: Float[ArrayLike, " mv"],
+    free_response: Float[ArrayLike, "horizon cv"],
+    setpoint: Float[ArrayLike, "horizon cv"],
+    previous_moves: Float[ArrayLike, "block mv"] | None = None,
     time_limit: float | None = None,
     gap: float = 1e-6,
     finish: str = "auto",

@@ -16,6 +16,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
 from jaxmpc.controller.batch import Lanes, for_all, place, variant_mesh
 from jaxmpc.controller.continuous import ContinuousController, ControllerState
@@ -32,6 +34,7 @@ from jaxmpc.loop.together import advance_together, errors_of
 from jaxmpc.loop.trajectory import RECORDABLE, Trajectory, TrajectoryBatch
 from jaxmpc.problem.structure import Structure
 from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.stateful import StatefulPlant
 from jaxmpc.process.well.host import HostWell
 
 LANES = 256  # of a sweep that run side by side
@@ -40,14 +43,14 @@ Progress = Callable[[int, int], None]
 
 def simulate(
     controller: ContinuousController | MixedIntegerController,
-    plant: Any,
+    plant: WellPlant | StatefulPlant,
     reference: Reference,
     *,
     samples: int | None = None,
-    disturbance=None,
-    noise=None,
+    disturbance: Float[ArrayLike, " sample"] | None = None,
+    noise: Float[ArrayLike, " cv"] | None = None,
     seed: int = 0,
-    faults=None,
+    faults: Float[ArrayLike, "sample cv"] | None = None,
     position_feedback: bool = False,
     changes: Sequence[tuple[float, ContinuousController | MixedIntegerController]] = (),
     open_loop_from: float | None = None,
@@ -272,11 +275,11 @@ def simulate_batches(
     reference: Reference | Sequence[Reference],
     *,
     samples: int | None = None,
-    disturbance=None,
-    noise=None,
-    seed=0,
-    faults=None,
-    position_feedback: Any = False,
+    disturbance: Float[ArrayLike, "*lane sample"] | None = None,
+    noise: Float[ArrayLike, "*lane cv"] | None = None,
+    seed: Int[ArrayLike, "*lane"] = 0,
+    faults: Float[ArrayLike, "*lane sample cv"] | None = None,
+    position_feedback: ArrayLike = False,
     record: Sequence[str] = RECORDABLE,
     lanes_at_once: int = LANES,
     devices: Sequence[Any] | None = None,

@@ -12,9 +12,11 @@ from typing import Literal
 
 import numpy as np
 
+from jaxmpc import html
 from jaxmpc.errors import InputError
+from jaxmpc.problem.declared import LARGEST as LARGEST
+from jaxmpc.problem.declared import declare, declared
 
-LARGEST = 1e30  # size of a number from which on it cannot be meant, and products of squares overflow
 THESIS_BLOCKS = (1, 1, 1, 1, 2, 2, 4, 4, 8, 8, 8, 16, 16, 32, 32, 64)  # (6.3)
 
 
@@ -22,35 +24,48 @@ THESIS_BLOCKS = (1, 1, 1, 1, 2, 2, 4, 4, 8, 8, 8, 16, 16, 32, 32, 64)  # (6.3)
 class Structure:
     """Static configuration of a controller; checked on construction.
 
-    Attributes:
-        cv_names, mv_names: names, in the order of every array.
-        dt: sampling interval [s].
-        prediction_horizon: Hp [samples]; predictions are j = 1..Hp, j = 1 being the next measurement.
-        control_horizon: Hu [samples].
-        first_penalised: Hw [samples], the first j with tracking, deadzone and CV-limit cost.
-        blocks: block lengths [samples], summing to Hu; empty means no blocking (Hu blocks of one).
-        blocking: ``moves`` (the move is constant over a block, thesis figure 25) or ``inputs`` (the MV is constant over
-            a block, thesis 6.2: it moves at block starts only).
-        integer_step: step size of every integer MV [MV unit], ``None`` for a continuous one; empty means none is integer.
-        mean_move_window: samples over which the mean move is taken (thesis 6.6: 25).
-        mean_move_mode: ``reactive`` (thesis: once the mean of the past moves exceeds the limit, no move in
-            that direction) or ``predictive`` (rows on the windowed sum inside the control horizon).
-        cv_units, mv_units: engineering units, for labels.
+    With blocking ``moves`` the move is constant over a block (thesis figure 25), with ``inputs`` the MV is (thesis 6.2):
+    it moves at block starts only. The mean-move limit is ``reactive`` (thesis: once the mean of the past moves exceeds
+    the limit, no move in that direction) or ``predictive`` (rows on the windowed sum inside the control horizon).
     """
 
-    cv_names: tuple[str, ...]
-    mv_names: tuple[str, ...]
-    dt: float = 10.0
-    prediction_horizon: int = 250
-    control_horizon: int = 200
-    first_penalised: int = 1
-    blocks: tuple[int, ...] = THESIS_BLOCKS
-    blocking: Literal["moves", "inputs"] = "moves"
-    integer_step: tuple[float | None, ...] = ()
-    mean_move_window: int = 25
-    mean_move_mode: Literal["reactive", "predictive"] = "reactive"
-    cv_units: tuple[str, ...] = ()
-    mv_units: tuple[str, ...] = ()
+    cv_names: tuple[str, ...] = declare("", "names of the CVs", "in the order of every array")
+    mv_names: tuple[str, ...] = declare("", "names of the MVs", "in the order of every array")
+    dt: float = declare("s", "sampling interval", preset=10.0)
+    prediction_horizon: int = declare(
+        "samples",
+        "prediction horizon",
+        "j = 1..Hp, of which 1 is the next measurement",
+        "H_p (5.1)",
+        preset=250,
+    )
+    control_horizon: int = declare("samples", "control horizon", "", "H_u (5.1)", preset=200)
+    first_penalised: int = declare(
+        "samples", "first penalised sample", "the first j that costs anything", "H_w (5.1)", preset=1
+    )
+    blocks: tuple[int, ...] = declare(
+        "samples",
+        "lengths of the blocks",
+        "they sum to Hu; empty: no blocking",
+        "(6.3)",
+        preset=THESIS_BLOCKS,
+    )
+    blocking: Literal["moves", "inputs"] = declare(
+        "", "blocking mode", "what a block holds constant", "6.2", preset="moves", choices=("moves", "inputs")
+    )
+    integer_step: tuple[float | None, ...] = declare(
+        "MV unit", "step of {}", "None if continuous; empty if all are", "6.2", of="mv", preset=()
+    )
+    mean_move_window: int = declare("samples", "window of the mean move", "", "6.6", preset=25)
+    mean_move_mode: Literal["reactive", "predictive"] = declare(
+        "", "mode of the mean-move limit", "", "6.6", preset="reactive", choices=("reactive", "predictive")
+    )
+    cv_units: tuple[str, ...] = declare("", "units of the CVs", "for labels", preset=())
+    mv_units: tuple[str, ...] = declare("", "units of the MVs", "for labels", preset=())
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        return html.fields("Structure", self, declared(Structure))
 
     def __post_init__(self):
         for key in ("prediction_horizon", "control_horizon", "first_penalised", "mean_move_window"):
@@ -74,10 +89,10 @@ class Structure:
                 list(blocks),
                 f"lengths that sum to control_horizon = {self.control_horizon} samples (they sum to {sum(blocks)})",
             )
-        if self.blocking not in ("moves", "inputs"):
-            raise InputError("structure.blocking", self.blocking, "'moves' or 'inputs'")
-        if self.mean_move_mode not in ("reactive", "predictive"):
-            raise InputError("structure.mean_move_mode", self.mean_move_mode, "'reactive' or 'predictive'")
+        for key, field in declared(Structure).items():
+            value, expected = getattr(self, key), " or ".join(map(repr, field.choices))
+            if expected and value not in field.choices:
+                raise InputError(f"structure.{key}", value, expected)
         if not (isinstance(self.dt, (int, float)) and math.isfinite(self.dt) and self.dt > 0):
             raise InputError("structure.dt", self.dt, "a positive sampling interval [s]")
         steps = tuple(self.integer_step) or (None,) * self.mv_count

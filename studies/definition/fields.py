@@ -7,15 +7,16 @@ the definition is checked against it, axes take their units and labels from it, 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 from decimal import Decimal
 from typing import Any, Literal
 
 import numpy as np
 
-from jaxmpc.errors import InputError
-from jaxmpc.problem.tuning import CV_FIELDS, LIMITS, MV_FIELDS, UNITS
+from jaxmpc.errors import InputError, near
+from jaxmpc.problem.declared import LARGEST, declared
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS, WellParameters
 from studies.definition import presets, references
 
@@ -67,10 +68,9 @@ class Field:
         words = (
             "a whole number" if self.kind == "whole" else "a number" if self.infinite else "a finite number"
         )
-        if self.low > -math.inf and self.high < math.inf:
-            words += f" from {self.low:.10g} to {self.high:.10g}"
-        elif self.low > -math.inf:
-            words += f" of {self.low:g} or more"
+        if self.low > -math.inf:
+            bounded = self.high < LARGEST
+            words += f" from {self.low:.10g} to {self.high:.10g}" if bounded else f" of {self.low:g} or more"
         return f"{words} [{self.unit}]" + (" or inf for no limit" if self.infinite else "")
 
     def check(self, path: str, value: Any) -> Any:
@@ -78,33 +78,28 @@ class Field:
 
         Numbers become floats, whole numbers ints, lengths tuples of ints.
         """
-        expected = f"{self.expected} for {self.key}"
+        shown, hint = value, ""
         if self.kind == "flag":
-            if not isinstance(value, bool):
-                raise InputError(path, value, expected)
-            return value
-        if self.kind == "text":
-            if not isinstance(value, str) or value not in self.choices:
-                raise InputError(path, value, expected, near(value, self.choices))
-            return value
-        if self.kind == "lengths":
-            whole = isinstance(value, (list, tuple)) and all(type(v) is int and v >= 1 for v in value)
-            if not whole or not 1 <= sum(value) <= LONGEST:
-                raise InputError(path, value, expected)
-            return tuple(value)
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise InputError(path, value, expected)
-        if isinstance(value, int) and value.bit_length() > 63:  # no float has room for some of them
-            raise InputError(path, f"{value.bit_length()} bits", expected)
-        if math.isnan(value):
-            raise InputError(path, value, expected)
-        if math.isinf(value) and not self.infinite:
-            raise InputError(path, value, expected)
-        if self.kind == "whole" and value != int(value):
-            raise InputError(path, value, expected)
-        if not self.low <= value <= self.high:
-            raise InputError(path, value, expected)
-        return int(value) if self.kind == "whole" else float(value)
+            good = isinstance(value, bool)
+        elif self.kind == "text":
+            good = isinstance(value, str) and value in self.choices
+            hint = near(value, self.choices) if not good else ""
+        elif self.kind == "lengths":
+            good = isinstance(value, (list, tuple)) and all(type(v) is int and v >= 1 for v in value)
+            good = good and 1 <= sum(value) <= LONGEST
+        elif isinstance(value, bool) or not isinstance(value, (int, float)):
+            good = False
+        elif isinstance(value, int) and value.bit_length() > 63:  # no float has room for some of them
+            good, shown = False, f"{value.bit_length()} bits"
+        else:
+            good = self.low <= value <= self.high and (self.infinite or math.isfinite(value))
+            good = good and (self.kind != "whole" or value == int(value))
+            if good and LARGEST < abs(value) < math.inf:
+                good, hint = False, f"Numbers go up to {LARGEST:g}"
+        if not good:
+            raise InputError(path, shown, f"{self.expected} for {self.key}", hint)
+        plain = {"whole": int, "number": float, "lengths": tuple}.get(self.kind)
+        return plain(value) if plain else value
 
     def parse(self, path: str, text: str) -> Any:
         """The value that a cell of a CSV file holds; lengths are separated by spaces."""
@@ -137,12 +132,6 @@ def as_text(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     return value if isinstance(value, str) else " ".join(str(v) for v in value)
-
-
-def near(given: Any, known) -> str:
-    """``Did you mean ...?`` for the closest known names; empty where none is close."""
-    found = difflib.get_close_matches(str(given), list(known), n=3, cutoff=0.6)
-    return f"Did you mean {' or '.join(found)}?" if found else ""
 
 
 # -------------------------------------------------------------------------------------------------------- the well
@@ -182,76 +171,46 @@ def plant_si(name: str, value: float) -> float:
 
 # ------------------------------------------------------------------------------------------------------- the table
 
-_TUNING_LABELS = {
-    "cv_weight": "weight of the deviation of",
-    "soft_quadratic": "quadratic weight beyond the deadzone of",
-    "soft_linear": "linear weight beyond the deadzone of",
-    "deadzone": "deadzone of",
-    "cv_low": "low limit of",
-    "cv_high": "high limit of",
-    "slack_weight": "price of limit violation of",
-    "move_weight": "move weight of",
-    "mv_low": "low limit of",
-    "mv_high": "high limit of",
-    "move_low": "largest move down of",
-    "move_high": "largest move up of",
-    "mean_move_limit": "limit of the mean move of",
-    "measurement_low": "least measurement that counts of",
-    "measurement_high": "largest measurement that counts of",
-    "frozen_limit": "equal measurements in a row that are too many of",
-    "bad_limit": "bad measurements in a row that switch off",
-    "bias_decay": "time constant of the fading bias of",
-    "demand_lead": "how far the demand may lead the position of",
-}
 _SPOKEN = {
     name: "the " + {"gas_lift": "gas lift"}.get(name, name.replace("_", " "))
     for name in (*CV_NAMES, *MV_NAMES)
 }
 
 
-def _unit(field: str, unit: str) -> str:
-    """Unit of a tuning field for a CV or MV of this unit."""
-    words = UNITS[field]
-    if words in ("s", "samples"):
-        return words
-    short = unit if unit == "%" else f"({unit})"
-    if words.startswith("1/"):
-        return "1/" + (f"{short}^2" if words.endswith("^2") else unit if unit == "%" else short)
-    return unit + (" per sample" if words.endswith("per sample") else "")
-
-
 def _table() -> dict[str, Field]:
-    samples: dict[str, Any] = dict(kind="whole", low=1, high=LONGEST, shape=True)
-    first = presets.structure()
+    structure = declared(Structure)
+
+    def shaping(key: str, **more: Any) -> Field:
+        """A field of the structure, in whole samples where it is not one of a few texts."""
+        field = structure[key]
+        given: dict[str, Any] = dict(kind="text", choices=field.choices)
+        given = given if field.choices else dict(kind="whole", low=1, high=LONGEST)
+        given |= dict(unit=field.unit, default=field.default, shape=True)
+        return Field(key, field.meaning, **(given | more))
+
     out = [
         Field("controller", "controller", "", "text", "mixed-integer", ("continuous", "mixed-integer"), True),
         Field("actuator", "choke actuator", "", "text", "step", ("continuous", "step"), True),
         Field("preset", "tuning preset", "", "text", "thesis", tuple(presets.TUNINGS)),
         Field("soft", "Soft MPC", "", "flag", True),
-        Field("blocking", "blocking mode", "", "text", "moves", ("moves", "inputs", "none"), True),
-        Field("blocks", "lengths of the blocks", "", "lengths", first.blocks, shape=True),
-        Field("prediction_horizon", "prediction horizon", "samples", default=250, **samples),
-        Field("control_horizon", "control horizon", "samples", **samples),
-        Field("first_penalised", "first penalised sample", "samples", default=1, **samples),
-        Field("mean_move_window", "window of the mean move", "samples", default=25, **samples),
-        Field(
-            "mean_move_mode",
-            "mode of the mean-move limit",
-            "",
-            "text",
-            "reactive",
-            ("reactive", "predictive"),
-            True,
-        ),
+        shaping("blocking", choices=("moves", "inputs", "none")),
+        shaping("blocks", kind="lengths", unit=""),
+        shaping("prediction_horizon"),
+        shaping("control_horizon", default=None),
+        shaping("first_penalised"),
+        shaping("mean_move_window"),
+        shaping("mean_move_mode"),
     ]
-    for fields, names, units in ((CV_FIELDS, CV_NAMES, CV_UNITS), (MV_FIELDS, MV_NAMES, MV_UNITS)):
-        for field in fields:
-            for name, unit in zip(names, units, strict=True):
-                key, label = f"tuning.{field}.{name}", f"{_TUNING_LABELS[field]} {_SPOKEN[name]}"
-                out.append(Field(key, label, _unit(field, unit), infinite=field in LIMITS))
+    for of, names, units in (("cv", CV_NAMES, CV_UNITS), ("mv", MV_NAMES, MV_UNITS), ("", ("",), ("",))):
+        for key, field in TUNING.items():
+            common: dict[str, Any] = dict(infinite=field.infinite, low=field.least)
+            for name, unit in zip(names, units, strict=True) if field.of == of and not field.flag else ():
+                label = field.meaning.format(_SPOKEN.get(name))
+                out.append(Field(f"tuning.{key}.{name}".rstrip("."), label, field.unit_of(unit), **common))
     out += [
-        Field("tuning.bias_cutoff", "cut-off of the bias filter", "rad/s", infinite=True),
-        Field("tuning.oscillation_rows", "no reversal from one sample to the next", "", "flag", True),
+        Field(f"tuning.{key}", field.meaning, "", "flag", True) for key, field in TUNING.items() if field.flag
+    ]
+    out += [
         # the step test moves the choke by 2 % from here, and stays within its range
         Field("model.choke", "choke of the model's working point", "%", default=50.0, low=0, high=98),
         Field("model.lift", "gas lift of the model's working point", "m3/h", default=7500.0, low=0),

@@ -18,7 +18,8 @@ from jaxmpc.errors import InputError
 from jaxmpc.loop.noise import check_deviation, check_seed
 from jaxmpc.loop.reference import Reference
 from jaxmpc.problem.structure import Structure
-from jaxmpc.problem.tuning import CV_FIELDS, DEFAULTS, LIMIT_PAIRS, LIMITS, MV_FIELDS, make_tuning
+from jaxmpc.problem.tuning import FIELDS as TUNING
+from jaxmpc.problem.tuning import LIMIT_PAIRS
 from jaxmpc.process.plant import check_inputs
 from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES, WellParameters, check_parameters
 from studies.definition import presets, references
@@ -27,12 +28,10 @@ from studies.definition.fields import FIELDS, PLANT_FIELDS, SHIPPED, plant_si
 from studies.definition.sections import InlineReference
 from studies.definition.sweep import StudyDefinition
 
-NAMES = {**dict.fromkeys(CV_FIELDS, CV_NAMES), **dict.fromkeys(MV_FIELDS, MV_NAMES)}
+_NAMES_OF = {"cv": CV_NAMES, "mv": MV_NAMES, "": ("",)}
+NAMES = {key: _NAMES_OF[field.of] for key, field in TUNING.items() if not field.flag}
 SHAPE_KEYS = tuple(field.key for field in FIELDS.values() if field.shape)
 LONGEST_RUN = 1_000_000  # samples
-LISTED = (
-    200  # entries of an axis up to which each is checked by itself, instead of the smallest and the largest
-)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -234,14 +233,14 @@ def _tuning(settings: Settings, integer: np.ndarray) -> dict[str, np.ndarray]:
     for field, names in NAMES.items():
         columns = []
         for name in names:
-            key = f"tuning.{field}.{name}"
+            key = f"tuning.{field}.{name}".rstrip(".")
             of_preset = np.array([_number(field, table, name) for table in tables])[preset]
             columns.append(settings.numbers(key) if settings.given(key) else of_preset)
-            _check_tuning_entries(settings, key, field, name)
-        out[field] = np.stack(np.broadcast_arrays(*columns), axis=1)
+        out[field] = np.stack(np.broadcast_arrays(*columns), axis=1) if names[0] else columns[0]
     for low, high in LIMIT_PAIRS:
         smaller, larger = np.broadcast_arrays(out[low], out[high])
-        for k, i in np.argwhere(smaller > larger)[:1].tolist():
+        wrong = (smaller > larger) | np.isposinf(smaller) | np.isneginf(larger)
+        for k, i in np.argwhere(wrong)[:1].tolist():
             name = NAMES[low][i]
             keys = [f"tuning.{field}.{name}" for field in (low, high)]
             keys = [key for key in keys if settings.given(key)] or keys
@@ -250,10 +249,6 @@ def _tuning(settings: Settings, integer: np.ndarray) -> dict[str, np.ndarray]:
                 f"{low} {smaller[k, i]:g}, {high} {larger[k, i]:g}",
                 f"{low} of {name} at most its {high} [{FIELDS[f'tuning.{low}.{name}'].unit}]",
             )
-    cutoff = "tuning.bias_cutoff"
-    _check_tuning_entries(settings, cutoff, "bias_cutoff", None)
-    of_preset = np.array([table["bias_cutoff"] for table in tables])[preset]
-    out["bias_cutoff"] = settings.numbers(cutoff) if settings.given(cutoff) else of_preset
     rows = settings.numbers("tuning.oscillation_rows").astype(bool)
     rows, whole = np.broadcast_arrays(rows, integer)
     out["oscillation_rows"] = np.stack([rows & whole, np.zeros_like(whole)], axis=1)
@@ -274,36 +269,9 @@ def _without_soft(settings: Settings, out: dict[str, np.ndarray]) -> dict[str, n
 
 def _number(field: str, preset: dict[str, Any], name: str) -> float:
     """A preset's value of a field, or what holds where it says nothing."""
-    value = preset[field][name] if field in preset else None
-    return DEFAULTS[field] if value is None else value
-
-
-def _check_tuning_entries(settings: Settings, key: str, field: str, name: str | None) -> None:
-    """Build a tuning with one entry at a time, all else neutral.
-
-    What `make_tuning` accepts of a single number is an interval, so where an axis has many entries the smallest and the
-    largest stand for all. What it asks of two numbers together (crossed limits) is checked for every scenario.
-    """
-    found = settings.table.column(key)
-    if found is None and key not in settings.base:
-        return
-    values = [settings.base[key]] if found is None else found[1]
-    entries = (
-        range(len(values)) if len(values) <= LISTED else [int(np.argmin(values)), int(np.argmax(values))]
-    )
-    neutral = {n: (None if field in LIMITS else 0.0) for n in NAMES.get(field, ())}
-    for j in entries:
-        given = values[j] if name is None else {**neutral, name: values[j]}
-        fields = {"cv_weight": 0.0, "move_weight": 0.0, field: given}
-        try:
-            make_tuning(presets.structure(), **fields)
-        except InputError as error:
-            path = f"base.{key}" if found is None else settings.table.axes[found[0]].path(key, j)
-            expected = (
-                "0 or more" if field not in (*LIMITS, "bias_cutoff") else error.expected.partition(" [")[0]
-            )
-            unit = FIELDS[key].unit
-            raise InputError(path, values[j], f"{expected} [{unit}] for {key}") from None
+    value = preset.get(field)
+    value = value[name] if isinstance(value, dict) else value
+    return TUNING[field].default if value is None else value
 
 
 # ----------------------------------------------------------------------------------------------- well and pressure

@@ -136,6 +136,18 @@ class Quick(Section, frozen=True):
     axes: dict[str, Any] = {}
 
 
+class StudyFile(Section, frozen=True):
+    """The whole file; `studies.definition.sweep.settings` looks into the base."""
+
+    study: StudySection
+    base: Any = {}
+    axes: tuple[Axis, ...] = ()
+    sampling: Sampling = Sampling()
+    search: Search | None = None
+    store: Store = Store()
+    quick: Quick | None = None
+
+
 class PressureStep(Section, frozen=True):
     """``[[base.disturbance]]``: the reservoir pressure is off by `offset` [bar] from `time` [s] on."""
 

@@ -18,15 +18,14 @@ import msgspec
 from msgspec import UNSET
 
 from jaxmpc.controller.measurement import FAULTS
-from jaxmpc.errors import InputError
+from jaxmpc.decoding import decode
+from jaxmpc.errors import InputError, near
 from jaxmpc.process.well.equations import CV_NAMES
-from studies.definition.fields import FIELDS, near, similar_end
+from studies.definition.fields import FIELDS, similar_end
 from studies.definition.sections import (
     STORABLE,
     Axis,
-    CsvSource,
     Cut,
-    Distribution,
     FaultSection,
     InlineReference,
     PressureStep,
@@ -34,8 +33,8 @@ from studies.definition.sections import (
     Range,
     Sampling,
     Search,
-    Section,
     Store,
+    StudyFile,
     StudySection,
 )
 
@@ -80,42 +79,30 @@ class StudyDefinition:
         Raises:
             InputError: naming the path of the field, for unknown or missing keys and wrong types.
         """
-        sections = ("study", "base", "axes", "sampling", "search", "store", "quick")
-        if not isinstance(body, dict):
-            raise InputError("study definition", body, f"tables {', '.join(sections)}")
-        _check_plain(body)
-        for name in body:
-            if name not in sections:
-                raise InputError(
-                    str(name), body[name], f"a table {', '.join(sections)}", near(name, sections)
-                )
-        axes = body.get("axes", [])
-        if not isinstance(axes, list):
-            raise InputError("axes", axes, "a list of tables, each headed [[axes]]")
-        study = _convert(body.get("study", {}), StudySection, "study")
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", study.name):
+        if isinstance(body, dict):
+            _check_plain(body)
+        file = _convert({"study": {}} | body if isinstance(body, dict) else body, StudyFile, "")
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", file.study.name):
             expected = "up to 100 letters, digits, '-', '_' and '.': it names the folder of the results"
-            raise InputError("study.name", study.name, expected)
-        quick = _convert(body["quick"], Quick, "quick") if "quick" in body else None
-        search = _convert(body["search"], Search, "search") if "search" in body else None
-        if search is not None and "sampling" in body:
+            raise InputError("study.name", file.study.name, expected)
+        if file.search is not None and "sampling" in body:
             raise InputError("sampling", body["sampling"], "no such table: [search] draws from the axes")
         out = cls(
-            study=study,
-            base=settings(body.get("base", {}), "base"),
-            axes=tuple(_convert(axis, Axis, f"axes[{i}]") for i, axis in enumerate(axes)),
-            sampling=_convert(body.get("sampling", {}), Sampling, "sampling"),
-            store=_convert(body.get("store", {}), Store, "store"),
-            quick=quick,
-            places=tuple(f"axes[{i}]" for i in range(len(axes))),
+            study=file.study,
+            base=settings(file.base, "base"),
+            axes=file.axes,
+            sampling=file.sampling,
+            store=file.store,
+            quick=file.quick,
+            places=tuple(f"axes[{i}]" for i in range(len(file.axes))),
             folder=str(folder),
             body=body,
-            search=search,
+            search=file.search,
         )
         for i, name in enumerate(out.store.trajectories):
             if name in out.store.trajectories[:i]:
                 raise InputError(f"store.trajectories[{i}]", name, "each trajectory once")
-        if quick is not None:
+        if file.quick is not None:
             out.cut()  # so that a mistake in it is found by every run
         return out
 
@@ -316,8 +303,9 @@ def _sensor_faults(value: Any, where: str) -> tuple[FaultSection, ...]:
     return faults
 
 
-_NESTED: dict[str, type[Section]] = {"range": Range, "distribution": Distribution, "csv": CsvSource}
 _EXPECTED = {
+    "axes": "a list of tables, each headed [[axes]]",
+    "quick.axes": "a table of keys",
     "study.name": "text in quotes, the name of the study",
     "chunk_size": "a whole number of 1 or more [scenarios]",
     "confirmation_limit": "a whole number of 1 or more [scenarios]",
@@ -343,46 +331,14 @@ _EXPECTED = {
     "setpoints": f"a list of rows, one number per CV ({', '.join(CV_NAMES)}) [m3/h]",
     "duration": "a length of the run [s]",
 }
-_KIND = {
-    "float": "a finite number",
-    "int": "a whole number",
-    "str": "text in quotes",
-    "object": "a table",
-    "array": "a list",
-}
 
 
 def _convert(body: Any, section: type[T], path: str) -> T:
-    """The decoded section, or an InputError with the path that msgspec found, below `path`."""
-    try:
-        return msgspec.convert(body, section)
-    except msgspec.ValidationError as error:
-        message, _, where = str(error).partition(" - at `$")
-        inner = where.rstrip("`").lstrip(".")
-        value, struct, full = body, section, path
-        for name, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", inner):
-            value = value[name] if name else value[int(index)]
-            struct = _NESTED.get(name, struct)
-            full += f".{name}" if name else f"[{index}]"
-        if found := re.search(r"unknown field `(.*)`", message):
-            known = msgspec.structs.fields(struct)  # type: ignore[arg-type]
-            names = [field.encode_name for field in known]
-            raise InputError(
-                f"{full}.{found[1]}",
-                value[found[1]],
-                f"one of the keys {', '.join(names)}",
-                near(found[1], names),
-            ) from None
-        if found := re.search(r"missing required field `(.*)`", message):
-            raise InputError(
-                f"{full}.{found[1]}", None, f"{_expected(f'{full}.{found[1]}')}; it is missing"
-            ) from None
-        found = re.match(r"Expected `(\w+)", message)
-        fallback = _KIND.get(found[1], message[0].lower() + message[1:]) if found else message
-        raise InputError(full, value, _expected(full) or fallback) from None
+    """The decoded section, or an InputError with the path of what is wrong, below `path`."""
+    return decode(body, section, path, name="study definition", expected=_expected)
 
 
-def _expected(path: str) -> str:
-    plain = re.sub(r"\[\d+\]", "", path)
-    ends = [".".join(plain.split(".")[-parts:]) for parts in (2, 1)]
-    return next((_EXPECTED[end] for end in (plain, *ends) if end in _EXPECTED), "")
+def _expected(path: str, words: str) -> str:
+    """What a key takes, found by its whole path or by the end of it."""
+    ends = [path, *(".".join(path.split(".")[-parts:]) for parts in (2, 1))]
+    return next((_EXPECTED[end] for end in ends if end in _EXPECTED), words)

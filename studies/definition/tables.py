@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxmpc.errors import InputError
-from studies.definition.fields import Field, near
+from jaxmpc.errors import InputError, near
+from studies.definition.fields import Field
 
 
 def read_rows(folder: Path, name: str, place: str) -> tuple[list[str], list[list[str]]]:

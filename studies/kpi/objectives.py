@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 from msgspec import UNSET
 
-from jaxmpc.errors import InputError
+from jaxmpc.errors import InputError, near
 from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES
 from studies.definition import presets
-from studies.definition.fields import near
 from studies.definition.sections import Search
 from studies.kpi.sweep import KPIS
 from studies.store.comparison import provenance

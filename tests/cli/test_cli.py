@@ -333,7 +333,7 @@ def test_the_thesis_study_gets_its_options_and_bad_ones_are_reported(stub, tmp_p
 
 
 def test_every_study_of_the_catalogue_can_be_named_on_the_command_line():
-    from jaxmpc.cli.options import COMPARISONS
+    from jaxmpc.cli.study import COMPARISONS
     from studies.thesis.catalogue import STUDIES
 
     assert set(STUDIES) <= set(COMPARISONS)

@@ -3,6 +3,7 @@
 Only what was said before Ctrl-C precedes the line: that programs are compiled, in one line too.
 """
 
+import dataclasses
 import json
 import os
 import re
@@ -239,7 +240,7 @@ def test_every_command_is_stopped_in_the_same_way_where_it_is_called(monkeypatch
     def stop(options):
         raise KeyboardInterrupt("2 of 3 chunks are stored.")
 
-    monkeypatch.setitem(cli.COMMANDS, "bench", stop)
+    monkeypatch.setitem(cli.COMMANDS, "bench", dataclasses.replace(cli.COMMANDS["bench"], run=stop))
     assert cli.main(["bench"]) == 130
     assert capsys.readouterr().err == "jaxmpc: stopped: 2 of 3 chunks are stored.\n"
 

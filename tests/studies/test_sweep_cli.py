@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from jaxmpc.cli.main import main
-from jaxmpc.cli.options import COMPARISONS
+from jaxmpc.cli.study import COMPARISONS
 from studies.definition.scenarios import load_study
 from studies.definition.sweep import shipped_studies
 from studies.run import runner

@@ -1,0 +1,222 @@
+"""``jaxmpc study run``, ``status`` and ``export``, and ``jaxmpc simulate``: studies and what they have stored."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+from jaxmpc.cli.options import (
+    EXIT_OPTIMAL,
+    EXIT_OTHER,
+    EXITS,
+    PLANTS,
+    Options,
+    choice,
+    command,
+    complain,
+    option,
+    switch,
+)
+from jaxmpc.errors import InputError, near
+from jaxmpc.files import check_folder
+
+COMPARISONS = (  # studies of a few controllers; the others are sweeps
+    *("thesis", "soft", "predictions", "fine-regulation", "disturbance", "without-soft", "unblocked"),
+    *("gain-scheduling", "mean-move", "time-limit", "rto", "claims"),
+)
+DASK = "scheduler of a dask.distributed cluster, such as tcp://host:8786"
+DRY_RUN = "say how many scenarios, chunks, bytes and minutes, and stop"
+STORE = option("store", "STORE", "the store of a sweep", Path)
+KINDS = {
+    "csv": "scenarios and key figures as text",
+    "parquet": "the same, binary; needs pyarrow",
+    "netcdf": "everything, trajectories included",
+}
+SWEEP_OPTIONS = ("store", "workers", "dask", "dry_run", "yes")
+
+
+@command(
+    "study run",
+    option("study", "STUDY", "name of a shipped study, or a definition FILE.toml", str),
+    switch("--quick", "the shortened version"),
+    option("--out", "DIR", "where results and figures go", Path("results")),
+    choice("--plant", PLANTS, "comparisons only: drive the FMU or its JAX twin (default: fmu)", default=None),
+    option("--store", "PATH.zarr", "sweeps only: the store (default: DIR/NAME.zarr)", Path),
+    option("--workers", "N", "sweeps only: processes (default: 1)", int),
+    option("--dask", "ADDRESS", f"sweeps only: {DASK}", str),
+    switch("--dry-run", f"sweeps only: {DRY_RUN}", default=None),
+    switch("--yes", "sweeps only: run more scenarios than the confirmation limit of the study", default=None),
+    epilog=f"Comparisons: thesis (three controllers over 78,000 s), {', '.join(COMPARISONS[1:])}. "
+    "Sweeps: deadzone, mismatch, blocking, robustness, tune (a search). "
+    f"A run that is stopped goes on where it was when the same command is given again. {EXITS}",
+)
+def run(options: Options) -> int:
+    """Run a study: the thesis comparison, another shipped study, or a sweep of your own from a TOML file."""
+    if options.study in COMPARISONS:
+        for name in SWEEP_OPTIONS:
+            if (value := getattr(options, name)) is not None:
+                expected = f"a sweep study; {options.study} runs in one process"
+                raise InputError(f"--{name.replace('_', '-')}", value, expected)
+        return _study_comparison(options)
+    if options.plant is not None:
+        raise InputError("--plant", options.plant, "a comparison such as thesis; sweeps run on the JAX well")
+    return _study_sweep(options)
+
+
+def _study_comparison(options: Options) -> int:
+    check_folder("--out", options.out)
+    asked = options.out, options.quick, options.plant or PLANTS[0]
+    if options.study == "claims":
+        from studies.thesis.claims_study import run_claims
+
+        print(f"Claims: {run_claims(*asked) / 'claims.html'}")
+        return EXIT_OPTIMAL
+    if options.study == "rto":
+        from figures.thesis.rto import draw_all as draw_rto
+        from studies.thesis.rto import run_rto
+
+        folder = run_rto(*asked)
+        draw_rto(folder)
+    else:
+        from figures.thesis.comparison import draw_all
+        from studies.thesis.catalogue import run_named
+        from studies.thesis.report import write_summary
+
+        folder = run_named(options.study, *asked)
+        draw_all(folder, options.study)
+        write_summary(folder, options.study)
+    print(f"Summary: {folder / 'summary.md'}, figures: {folder / 'figures'}")
+    return EXIT_OPTIMAL
+
+
+def _study_sweep(options: Options) -> int:
+    from studies.definition.scenarios import load_study
+
+    confirmed = bool(options.dry_run or options.yes)
+    try:
+        study = load_study(options.study, quick=options.quick, confirmed=confirmed)
+    except InputError as error:
+        raise _refused(error, options.study) from None
+    store = options.out / f"{study.name}.zarr" if options.store is None else options.store
+    if options.dry_run:
+        return _dry_run(study, store)
+    from studies.run.runner import RunError, run_study
+    from studies.search.study import SearchStudy
+
+    workers = 1 if options.workers is None else options.workers
+    spread = {"workers": workers, "dask": options.dask, "command": _again(options)}
+    try:
+        if isinstance(study, SearchStudy):
+            from studies.search.run import run_search
+
+            path = run_search(study, store, **spread)
+        else:
+            path = run_study(study, store, **spread)
+    except RunError as error:
+        return complain(error, EXIT_OTHER)
+    from figures.sweep.draw import draw_sweep
+
+    folder = path.with_name(f"{path.stem}-figures")
+    draw_sweep(path, folder)
+    print(f"Results: {path}, figures: {folder}")
+    print(f"Look at them with: jaxmpc study export {shlex.join([str(path), f'{path.stem}.csv'])}")
+    return EXIT_OPTIMAL
+
+
+def _refused(error: InputError, study: str) -> InputError:
+    """The error of a definition with what the command line can do about it."""
+    from studies.definition.sweep import shipped_studies
+
+    if error.field == "study.confirmation_limit":
+        hint = "Give --yes to run them all, --dry-run to see how long that takes"
+        return InputError(error.field, error.value, error.expected, hint)
+    if error.field == "study" and not os.path.exists(study):
+        sweeps, comparisons = ", ".join(shipped_studies()), ", ".join(COMPARISONS)
+        expected = f"a comparison ({comparisons}), a sweep ({sweeps}), or a definition file that exists"
+        return InputError("study", study, expected, near(study, [*COMPARISONS, *shipped_studies()]))
+    return error
+
+
+def _dry_run(study: Any, store: Path) -> int:
+    from studies.run.status import status_of
+
+    print(study.describe())
+    found = status_of(store, study.hash)
+    if found is not None:
+        print(f"so far      {found.so_far}", *filter(None, [found.pace]), sep="\n")
+    limit = study.definition.study.confirmation_limit
+    more = f" and with --yes: it has more than {limit} scenarios (study.confirmation_limit)"
+    print(f"To run it, give the command without --dry-run{more if study.count > limit else ''}.")
+    return EXIT_OPTIMAL
+
+
+def _again(options: Options) -> str:
+    """What follows ``jaxmpc study run`` to go on with a study, from any folder."""
+    from studies.definition.sweep import shipped_studies
+
+    name = options.study if options.study in shipped_studies() else str(Path(options.study).resolve())
+    return shlex.quote(name) + bool(options.quick) * " --quick" + bool(options.yes) * " --yes"
+
+
+@command("study status", STORE, switch("--verify", "read every file and compare checksums"))
+def status(options: Options) -> int:
+    """Say how far a sweep is, what is damaged, and what to do next."""
+    from studies.run import status
+
+    print(status.status(options.store, options.verify))
+    return EXIT_OPTIMAL
+
+
+@command(
+    "study export",
+    STORE,
+    option("target", "FILE", "where to write", Path, nargs="?"),
+    *(
+        switch(f"--{kind}", what, dest="kind", action="store_const", const=kind)
+        for kind, what in KINDS.items()
+    ),
+    switch("--overwrite", "replace the file if it is there"),
+)
+def export(options: Options) -> int:
+    """Write the results of a sweep to one file for other tools."""
+    from studies.store import export
+
+    suffix = {None: "csv", "netcdf": "nc"}.get(options.kind, options.kind)
+    target = options.target or Path(f"{options.store.stem}.{suffix}")
+    print(export.export(options.store, target, options.kind, options.overwrite))
+    return EXIT_OPTIMAL
+
+
+@command(
+    "simulate",
+    option("scenario", "STORE#NUMBER", "the store of a sweep and a scenario in it", str),
+    option("--out", "DIR", "where trajectory and figure go", Path("results")),
+)
+def simulate(options: Options) -> int:
+    """Run one scenario of a stored sweep again, in full, and plot it."""
+    store, mark, number = options.scenario.rpartition("#")
+    if not mark or not re.fullmatch("[0-9]{1,18}", number):
+        expected = "a store and a number, such as results/deadzone.zarr#12"
+        raise InputError("scenario", options.scenario, expected)
+    check_folder("--out", options.out)
+    import warnings
+
+    from studies.run.rerun import rerun
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        again = rerun(Path(store), int(number))
+    for warning in caught:
+        print(f"jaxmpc: {warning.message}", file=sys.stderr)
+    folder = options.out / f"{Path(store).stem}-{int(number)}"
+    print(again.save(folder))
+    from figures.sweep.draw import draw_run
+
+    look = {"kind": again.kind, "actuator": again.actuator}
+    for path in draw_run(again.trajectory, again.deadzone, folder, again.title, **look):
+        print(path)
+    return EXIT_OPTIMAL

@@ -1,0 +1,94 @@
+"""Tables of the documentation that follow from declarations; ``python -m tests.docs.test_tables`` writes them anew."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+
+from jaxmpc.problem.declared import declared
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import Tuning
+from studies.definition import presets
+from studies.definition.fields import FIELDS
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+TABLE = re.compile(r"(?:^\|.*\n)+", re.MULTILINE)
+
+
+def shown(value) -> str:
+    """A default as the pages write it."""
+    if value is None:
+        return "required"
+    if isinstance(value, bool):
+        return f"`{str(value).lower()}`"
+    if isinstance(value, tuple):
+        return " ".join(map(str, value)) or "none"
+    return f"`{value}`" if isinstance(value, str) else f"{value:g}"
+
+
+def table(head, rows) -> str:
+    """Markdown."""
+    lines = [" | ".join(["", *row, ""]).strip() for row in [head, *rows]]
+    lines.insert(1, "---".join("|" * (len(head) + 1)))
+    return re.sub(r"\|  (?=\|)", "| ", "\n".join(lines)) + "\n"
+
+
+def fields_of(kind) -> str:
+    """Every field of a class."""
+    head = ["field", "one per", "unit", "default", "meaning", "thesis"]
+    rows = [
+        [f"`{key}`", field.of.upper(), field.unit, shown(field.default), field.text, field.equation]
+        for key, field in declared(kind).items()
+    ]
+    return table(head, rows)
+
+
+def keys_of_studies() -> str:
+    """Every key below ``[base.tuning]``, with the default of the thesis preset."""
+    structure = presets.structure(integer=True)
+    tuning, rows = presets.tuning(structure), []
+    for key, field in FIELDS.items():
+        _, name, *of = key.split(".") if key.startswith("tuning.") else ("", "")
+        if name:
+            names = structure.cv_names + structure.mv_names
+            value = getattr(tuning, name)
+            value = value[names.index(of[0]) % 2] if of else value
+            default = field.default if field.kind == "flag" else float(value)
+            rows.append([f"`{key}`", field.unit, shown(default), field.label])
+    return table(["key", "unit", "default", "meaning"], rows)
+
+
+TABLES = {
+    ("api/models.md", "## Fields of a structure"): lambda: fields_of(Structure),
+    ("api/models.md", "## Fields of a tuning"): lambda: fields_of(Tuning),
+    ("studies.md", "### `[base.tuning]`: changes of the preset"): keys_of_studies,
+}
+
+
+def parts(page: str, heading: str) -> tuple[str, str, str]:
+    """A page before, in and after the first table below a heading."""
+    text = (DOCS / page).read_text()
+    start = text.index(f"\n{heading}\n") + len(heading) + 2
+    found = TABLE.search(text, start)
+    assert found, f"{page}: no table below {heading}"
+    return text[: found.start()], found[0], text[found.end() :]
+
+
+@pytest.mark.parametrize(("page", "heading"), TABLES)
+def test_a_table_of_fields_says_what_their_declarations_say(page, heading):
+    assert parts(page, heading)[1] == TABLES[page, heading]()
+
+
+@pytest.mark.parametrize("kind", [Structure, Tuning])
+def test_every_field_is_declared_with_its_meaning_and_numbers_with_their_unit(kind):
+    for field in dataclasses.fields(kind):
+        known = declared(kind)[field.name]
+        assert known.meaning
+        assert known.unit or known.flag or known.choices or field.name.endswith(("names", "units"))
+
+
+if __name__ == "__main__":
+    for (page, heading), made in TABLES.items():
+        before, _, after = parts(page, heading)
+        (DOCS / page).write_text(before + made() + after)
