@@ -13,16 +13,16 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.plant import WellPlant
 from jaxmpc.process.well.host import HostWell
-from studies.definition.comparison import PLANTS, ComparisonDefinition, PlantKind, ReferenceDefinition
+from studies.definition.comparison import ComparisonDefinition, PlantKind, ReferenceDefinition
 from studies.run.comparison import is_current, run_controller
 from studies.store.comparison import check_writable, open_results
 from studies.thesis import catalogue
 from studies.thesis.claims import ROWS, Claim, Evidence, judge, tables
+from studies.thesis.comparison import study_name
 
 FORMAT = "jaxmpc/claims/1"
 NEEDED = tuple(dict.fromkeys(row.study for row in ROWS))  # keys of `studies.thesis.catalogue.STUDIES`
@@ -56,9 +56,7 @@ def run_claims(
         InputError: for an unknown plant or a folder that cannot be written, before anything is computed.
         MissingToolError: if the FMU cannot be built.
     """
-    if plant not in PLANTS:
-        raise InputError("plant", plant, f"one of {', '.join(PLANTS)}")
-    folder = check_writable(Path(out) / f"claims-{'quick-' if quick else ''}{plant}")
+    folder = check_writable(Path(out) / study_name("claims", quick, plant))
     found: dict[str, Claim] = {}
     hashes: dict[str, str] = {}
     for study in NEEDED:

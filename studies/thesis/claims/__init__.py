@@ -8,7 +8,7 @@ need and writes the tables of `tables`; `claims` are the rows of the summary pag
 from __future__ import annotations
 
 import tomllib
-from importlib.resources import files
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -36,7 +36,7 @@ SUMMARY = (
 
 def _rows() -> tuple[Row, ...]:
     """The rows with the limits and phrases that their words name written out."""
-    body = tomllib.loads((files(__name__) / "rows.toml").read_text(encoding="utf-8"))
+    body = tomllib.loads(Path(__file__).with_name("rows.toml").read_text("utf-8"))
     known: dict[str, Any] = dict(vars(limits))
     known |= {name: words.format_map(known) for name, words in body["words"].items()}
     said = ("statement", "definition", "rule")
