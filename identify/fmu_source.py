@@ -155,15 +155,19 @@ def _variables(parameters: WellParameters) -> list[Variable]:
     """Every variable of the FMU, in the order of the model description."""
     start, inputs = start_state(parameters), (DEFAULT_CHOKE, DEFAULT_LIFT, 0.0)
     switch = "false: the built-in input sequence drives the well; true: the inputs do"
-    return [
-        *(Variable(name, VR_INPUT + i, *rest, "input", inputs[i]) for i, (name, *rest) in enumerate(INPUTS)),
-        Variable("SepticControl", VR_SEPTIC_CONTROL, None, switch, "input"),
-        *(Variable(name, VR_OUTPUT + i, *rest, "output") for i, (name, *rest) in enumerate(OUTPUTS)),
-        *(
-            Variable(f"state.{name}", VR_STATE + i, *rest, "local", start[i])
-            for i, (name, *rest) in enumerate(STATES)
-        ),
+    rows = [
+        Variable(name, VR_INPUT + i, unit, text, "input", inputs[i])
+        for i, (name, unit, text) in enumerate(INPUTS)
     ]
+    rows.append(Variable("SepticControl", VR_SEPTIC_CONTROL, None, switch, "input"))
+    rows += [
+        Variable(name, VR_OUTPUT + i, unit, text, "output") for i, (name, unit, text) in enumerate(OUTPUTS)
+    ]
+    rows += [
+        Variable(f"state.{name}", VR_STATE + i, unit, text, "local", start[i])
+        for i, (name, unit, text) in enumerate(STATES)
+    ]
+    return rows
 
 
 def _variable_xml(row: Variable, fmi: int) -> str:

@@ -15,11 +15,10 @@ import xarray as xr
 
 from identify.fmu import FmuPlant, build_fmu
 from identify.schedule import identify_schedule
-from identify.step_test import identify_step_response, settling_notes
+from identify.step_test import identify_step_response, identity, settling_notes
 from identify.sweep import steady_sweep
 from jaxmpc.errors import InputError
 from jaxmpc.process.plant import WellPlant
-from jaxmpc.process.well.equations import well_hash
 from studies.definition.comparison import (
     PLANTS,
     ComparisonDefinition,
@@ -109,10 +108,8 @@ def plant_factory(
         say: receives a line about the FMU.
     """
     if kind == "jax":
-        return (lambda actuator: WellPlant(actuator=actuator)), {
-            "kind": "jax",
-            "hash": well_hash(WellPlant().parameters),
-        }
+        known, digest = identity(WellPlant())
+        return (lambda actuator: WellPlant(actuator=actuator)), {"kind": known, "hash": digest}
     path = build_fmu()
     say(f"FMU: {path}")
     with FmuPlant(path) as built:
