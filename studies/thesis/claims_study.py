@@ -74,39 +74,20 @@ def run_claims(
         evidence = Evidence.of(data, clock)
         found |= {row.id: judge(row, evidence) for row in ROWS if row.study == study}
     claims = [found[row.id] for row in ROWS]
-    write_tables(claims, folder, quick, plant, hashes, gallery)
+    _write(claims, folder, quick, plant, hashes, gallery)
     say(f"{tables.tally(claims)}: {folder / 'claims.html'}")
     return folder
 
 
-def write_tables(
-    claims: list[Claim],
-    folder: Path,
-    quick: bool,
-    plant: PlantKind,
-    hashes: dict[str, str],
-    gallery: str = GALLERY,
+def _write(
+    claims: list[Claim], folder: Path, quick: bool, plant: PlantKind, hashes: dict[str, str], gallery: str
 ) -> None:
-    """Write the rows as ``claims.md``, ``claims.csv``, ``claims.json`` and ``claims.html``, each in one go.
-
-    Args:
-        claims: measured.
-        folder: for the files.
-        quick: whether the shortened studies were measured.
-        plant: of the studies.
-        hashes: which results were measured, study by study.
-        gallery: see `run_claims`.
-    """
+    """Write the rows as ``claims.md``, ``claims.csv``, ``claims.json`` and ``claims.html``, each in one go."""
     title = "The statements of the thesis, measured"
     well = "an FMU of the well" if plant == "fmu" else "the JAX twin of the well"
     note = f"Measured on our own runs: {'shortened' if quick else 'full'} studies, {well}."
-    body = {
-        "format": FORMAT,
-        "quick": quick,
-        "plant": plant,
-        "results": hashes,
-        "claims": msgspec.to_builtins(claims),
-    }
+    body = {"format": FORMAT, "quick": quick, "plant": plant, "results": hashes}
+    body["claims"] = msgspec.to_builtins(claims)
     write_atomically(folder / "claims.md", tables.markdown(claims, title))
     write_atomically(folder / "claims.csv", tables.table_csv(claims))
     write_atomically(folder / "claims.json", json.dumps(body, indent=1, ensure_ascii=False))
