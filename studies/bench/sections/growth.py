@@ -15,7 +15,7 @@ from studies.bench.instances import Instances, Problems
 from studies.bench.judge import Judge
 from studies.bench.lanes import Lanes
 from studies.bench.rows import Row, batched
-from studies.bench.sections.relaxed import TOLERANCE, clock
+from studies.bench.sections.relaxed import TOLERANCE, batch_times
 
 LANES = 32
 THESIS_LIKE = {"horizon": 250, "blocks": 16, "CVs": 2, "MVs": 2}
@@ -31,17 +31,14 @@ def growth(context: Context) -> Iterator[Row]:
             context.say(f"growth, {size} {axis}")
             instances = random_instances(np.random.default_rng(size), {**THESIS_LIKE, axis: size}, LANES)
             judge, lanes = Judge(instances.cases()), Lanes(instances)
-            batch = lanes.batch(lanes.cold, LANES)
-            solution = lanes.solve_batch(batch)
-            seconds = min(clock(lanes, batch) for _ in range(3))
-            judge.hear("jaxmpc", lanes.plans(solution.x))
-            times = None
+            times, _ = batch_times(lanes, judge, "jaxmpc", "cold", LANES, 3)
+            seconds, ratio = min(times), None
             if peer.missing() is None:
                 theirs, _, plans = ask(peer, context, judge.cases, TOLERANCE)
                 judge.hear(peer.name, plans)
-                times = float(theirs.sum()) / seconds
+                ratio = float(theirs.sum()) / seconds
             name, errors, to = f"growth, {axis} {size}", judge.errors("jaxmpc"), f"{peer.name} (one core)"
-            yield batched(name, "growth", seconds, LANES, errors, ratio=times, ratio_to=to, note=note)
+            yield batched(name, "growth", seconds, LANES, errors, ratio=ratio, ratio_to=to, note=note)
 
 
 def random_instances(rng: np.random.Generator, shape: dict[str, int], lanes: int) -> Instances:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from typing import Any
 
 import jax
 import numpy as np
@@ -58,7 +57,8 @@ def batches(context: Context) -> Iterator[Row]:
             rates["batch"].append(count)
             repeats = 1 if count > 1000 else 5 if count >= 64 else 20
             for start in STARTS:
-                seconds, errors = _batch(lanes, judge, start, count, repeats)
+                times, errors = batch_times(lanes, judge, f"{count} {start}", start, count, repeats)
+                seconds = float(np.median(times))
                 rates[start].append(count / seconds)
                 yield batched(
                     f"batch of {count}, {mode}, {start}",
@@ -76,22 +76,28 @@ def batches(context: Context) -> Iterator[Row]:
         context.series[f"batch {mode}"] = rates
 
 
-def _batch(lanes: Lanes, judge: Judge, start: str, count: int, repeats: int) -> tuple[float, np.ndarray]:
-    """Median seconds of a batch, and the errors of its distinct problems."""
+def batch_times(
+    lanes: Lanes, judge: Judge, who: str, start: str, count: int, repeats: int
+) -> tuple[list[float], np.ndarray]:
+    """Seconds of every repeated call for a batch, and the errors of its distinct problems.
+
+    Args:
+        lanes: the problems.
+        judge: of them; hears the plans.
+        who: name of the plans there.
+        start: one of `STARTS`.
+        count: size of the batch.
+        repeats: calls.
+    """
     batch = lanes.batch(getattr(lanes, start), count)
     solution = lanes.solve_batch(batch)  # compiles
-    seconds = float(np.median([clock(lanes, batch) for _ in range(repeats)]))
-    distinct, who = min(count, len(judge.cases)), f"{count} {start}"
+    times = [taken(functools.partial(lanes.solve_batch, batch))[0] for _ in range(repeats)]
+    distinct = min(count, len(judge.cases))
     judge.hear(who, lanes.plans(solution.x[:distinct]))
     errors = judge.errors(who)
     if np.asarray(solution.status[distinct:]).any():  # a repeated lane that is not solved
         errors[0] = np.inf
-    return seconds, errors
-
-
-def clock(lanes: Lanes, batch: Any) -> float:
-    """Seconds of one call for a batch."""
-    return taken(functools.partial(lanes.solve_batch, batch))[0]
+    return times, errors
 
 
 def devices(context: Context) -> Iterator[Row]:
@@ -107,11 +113,8 @@ def devices(context: Context) -> Iterator[Row]:
     for device in (jax.devices("cpu")[0], jax.devices()[0]):
         context.say(f"batch of {count} on {device}")
         with jax.default_device(device):
-            lanes = Lanes(instances)
-            batch = lanes.batch(lanes.cold, count)
-            solution = lanes.solve_batch(batch)
-            judge.hear(device.platform, lanes.plans(solution.x[: len(instances)]))
-            seconds[device.platform] = min(clock(lanes, batch) for _ in range(5))
+            times, _ = batch_times(Lanes(instances), judge, device.platform, "cold", count, 5)
+        seconds[device.platform] = min(times)
     for platform, own in seconds.items():
         name, errors = f"batch of {count}, {mode}, cold, on {platform}", judge.errors(platform)
         yield batched(name, "gpu", own, count, errors, ratio=seconds["cpu"] / own, ratio_to="the CPU")
