@@ -42,19 +42,12 @@ def run_claims(
     """Measure every row on the studies of the catalogue; what of them is stored and current is not run again.
 
     Args:
-        out: folder of all results; the tables go to ``claims-PLANT`` or ``claims-quick-PLANT`` in it.
-        quick: measure the shortened studies.
-        plant: ``fmu``, or ``jax`` for its JAX twin, which needs no C compiler.
-        progress: whether to show bars with rate and time left.
-        say: receives one line per event.
+        out, quick, plant, progress, say: as for `studies.thesis.catalogue.run_named`.
         gallery: page of the figures for the links of ``claims.html``, relative to it.
 
     Returns:
-        The folder with ``claims.md``, ``claims.csv``, ``claims.json`` and ``claims.html``.
-
-    Raises:
-        InputError: for an unknown plant or a folder that cannot be written, before anything is computed.
-        MissingToolError: if the FMU cannot be built.
+        The folder ``claims-PLANT`` or ``claims-quick-PLANT`` with ``claims.md``, ``claims.csv``, ``claims.json`` and
+        ``claims.html``; errors as for `run_named`.
     """
     folder = check_writable(Path(out) / study_name("claims", quick, plant))
     found: dict[str, Claim] = {}
@@ -87,7 +80,7 @@ def _write(
     well = "an FMU of the well" if plant == "fmu" else "the JAX twin of the well"
     note = f"Measured on our own runs: {'shortened' if quick else 'full'} studies, {well}."
     body = {"format": FORMAT, "quick": quick, "plant": plant, "results": hashes}
-    body["claims"] = msgspec.to_builtins(claims)
+    body["claims"] = [claim.written() for claim in claims]
     write_atomically(folder / "claims.md", tables.markdown(claims, title))
     write_atomically(folder / "claims.csv", tables.table_csv(claims))
     write_atomically(folder / "claims.json", json.dumps(body, indent=1, ensure_ascii=False))

@@ -90,19 +90,13 @@ def run_rto(
     """Compute and store both runs; what is stored already with equal inputs is kept.
 
     Args:
-        out: folder of all results; this study gets its own folder in it.
         quick: 1,200 instead of 2,880 samples.
         plant: ``jax``, or ``fmu``, whose steady map takes longer.
-        progress: whether to show bars with rate and time left.
-        say: receives one line per event.
+        out, progress, say: as for `studies.thesis.catalogue.run_named`.
 
     Returns:
         The folder of the study, with ``results.zarr`` (see `studies.store.comparison.open_results`), ``model.json``,
-        ``steady_map.json`` and ``summary.md``, where both runs settle.
-
-    Raises:
-        InputError: for an unknown plant or a folder that cannot be written, before anything is computed.
-        MissingToolError: if the FMU cannot be built.
+        ``steady_map.json`` and ``summary.md``, where both runs settle; errors as for `run_named`.
     """
     folder = check_writable(Path(out) / study_name("rto", quick, plant))
     demanded = demands(quick)

@@ -30,8 +30,8 @@ ROLES = {  # by kind of controller and actuator, whatever the run is called
 Condition = bool | np.bool_
 
 
-class Claim(msgspec.Struct, frozen=True):
-    """One statement of the thesis and what the results say.
+class Statement(msgspec.Struct, frozen=True):
+    """One statement of the thesis.
 
     Attributes:
         id: short and unique.
@@ -39,11 +39,8 @@ class Claim(msgspec.Struct, frozen=True):
         statement: the thesis, in our words.
         definition: how it is measured.
         rule: when it counts as holding.
-        value: the numbers, with units.
-        verdict: one of `VERDICTS`.
-        reason: what the data say about why it does not hold; empty if it does.
-        figures: ids of the figures that show it.
         study: of `studies.thesis.catalogue.STUDIES`, whose results are measured.
+        figures: ids of the figures that show it.
     """
 
     id: str
@@ -51,11 +48,29 @@ class Claim(msgspec.Struct, frozen=True):
     statement: str
     definition: str
     rule: str
+    study: str
+    figures: tuple[str, ...]
+
+
+class Claim(Statement, frozen=True):
+    """A statement and what the results say.
+
+    Attributes:
+        value: the numbers, with units.
+        verdict: one of `VERDICTS`.
+        reason: what the data say about why it does not hold; empty if it does.
+    """
+
     value: str
     verdict: str
     reason: str
-    figures: tuple[str, ...]
-    study: str
+
+    def written(self) -> dict[str, Any]:
+        """The fields by name in the order of the files."""
+        words = ("id", "section", "statement", "definition", "rule")
+        return {
+            name: getattr(self, name) for name in (*words, "value", "verdict", "reason", "figures", "study")
+        }
 
 
 class Finding(NamedTuple):
@@ -74,24 +89,16 @@ class Finding(NamedTuple):
     instead: str = ""
 
 
-class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Row(Statement, frozen=True, forbid_unknown_fields=True):
     """A statement that can be measured, from ``rows.toml``.
 
     Attributes:
-        id, section, statement, definition, rule, study, figures: as in `Claim`.
         needs: roles or names of the runs that the measurement is given.
         measure: function that takes the evidence and the names of `needs`, as ``module.function``.
         value: words for its numbers.
         reason: words for why it fails, or several by what the measurement says.
     """
 
-    id: str
-    section: str
-    statement: str
-    definition: str
-    rule: str
-    study: str
-    figures: tuple[str, ...]
     needs: tuple[str, ...]
     measure: str
     value: str
@@ -181,16 +188,10 @@ def claim_of(row: Row, found: Finding) -> Claim:
     numbers = vars(limits) | found.numbers
     reason = row.reason if isinstance(row.reason, str) else row.reason.get(found.why, "")
     return Claim(
-        id=row.id,
-        section=row.section,
-        statement=row.statement,
-        definition=row.definition,
-        rule=row.rule,
+        *(getattr(row, name) for name in Statement.__struct_fields__),
         value=found.instead or row.value.format_map(numbers),
         verdict=said,
         reason=reason.format_map(numbers) if said in VERDICTS[1:3] else "",
-        figures=row.figures,
-        study=row.study,
     )
 
 

@@ -7,8 +7,6 @@ import string
 from collections.abc import Sequence
 from pathlib import Path
 
-import msgspec
-
 from studies.thesis.claims.record import VERDICTS, Claim
 from studies.thesis.tables import csv_text, markdown_table
 
@@ -36,8 +34,8 @@ def markdown(claims: Sequence[Claim], title: str) -> str:
 
 def table_csv(claims: Sequence[Claim]) -> str:
     """One row per statement, the fields of `Claim` as columns; figures are separated by blanks."""
-    rows = (msgspec.structs.asdict(claim) | {"figures": " ".join(claim.figures)} for claim in claims)
-    return csv_text(Claim.__struct_fields__, [list(row.values()) for row in rows])
+    rows = [claim.written() | {"figures": " ".join(claim.figures)} for claim in claims]
+    return csv_text(list(rows[0]), [list(row.values()) for row in rows])
 
 
 def tally(claims: Sequence[Claim]) -> str:
@@ -64,7 +62,7 @@ def page(claims: Sequence[Claim], title: str, note: str, gallery: str) -> str:
 
 
 def _row(claim: Claim, gallery: str) -> str:
-    text = {name: html.escape(str(value)) for name, value in msgspec.structs.asdict(claim).items()}
+    text = {name: html.escape(str(value)) for name, value in claim.written().items()}
     links = ", ".join(
         f'<a href="{html.escape(gallery)}#figure-{html.escape(id)}">{html.escape(id)}</a>'
         for id in claim.figures
