@@ -10,7 +10,9 @@ from __future__ import annotations
 import hashlib
 from dataclasses import fields
 from importlib.resources import files
+from string import Template
 from types import SimpleNamespace
+from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import sympy
@@ -138,127 +140,79 @@ def start_state(parameters: WellParameters) -> tuple[float, ...]:
     return tuple(float(v) for v in WellPlant(parameters).init().x)
 
 
-def _variables(parameters: WellParameters) -> list[dict]:
+class Variable(NamedTuple):
+    """A variable of the FMU; one without a unit is Boolean."""
+
+    name: str
+    reference: int
+    unit: str | None
+    text: str
+    causality: str
+    start: float | None = None
+
+
+def _variables(parameters: WellParameters) -> list[Variable]:
     """Every variable of the FMU, in the order of the model description."""
-    start = start_state(parameters)
-    inputs = (DEFAULT_CHOKE, DEFAULT_LIFT, 0.0)
+    start, inputs = start_state(parameters), (DEFAULT_CHOKE, DEFAULT_LIFT, 0.0)
+    switch = "false: the built-in input sequence drives the well; true: the inputs do"
     rows = [
-        {
-            "name": name,
-            "vr": VR_INPUT + i,
-            "unit": unit,
-            "text": text,
-            "causality": "input",
-            "start": inputs[i],
-        }
+        Variable(name, VR_INPUT + i, unit, text, "input", inputs[i])
         for i, (name, unit, text) in enumerate(INPUTS)
     ]
-    rows.append(
-        {
-            "name": "SepticControl",
-            "vr": VR_SEPTIC_CONTROL,
-            "text": "false: the built-in input sequence drives the well; true: the inputs do",
-            "causality": "input",
-        }
-    )
+    rows.append(Variable("SepticControl", VR_SEPTIC_CONTROL, None, switch, "input"))
     rows += [
-        {"name": name, "vr": VR_OUTPUT + i, "unit": unit, "text": text, "causality": "output"}
-        for i, (name, unit, text) in enumerate(OUTPUTS)
+        Variable(name, VR_OUTPUT + i, unit, text, "output") for i, (name, unit, text) in enumerate(OUTPUTS)
     ]
     rows += [
-        {
-            "name": f"state.{name}",
-            "vr": VR_STATE + i,
-            "unit": unit,
-            "text": text,
-            "causality": "local",
-            "start": start[i],
-        }
+        Variable(f"state.{name}", VR_STATE + i, unit, text, "local", start[i])
         for i, (name, unit, text) in enumerate(STATES)
     ]
     return rows
 
 
-def _variable_xml(row: dict, fmi: int) -> str:
-    kind = {"input": "", "output": ' initial="calculated"', "local": ' initial="exact"'}[row["causality"]]
+def _variable_xml(row: Variable, fmi: int) -> str:
+    initial = {"input": "", "output": ' initial="calculated"', "local": ' initial="exact"'}[row.causality]
+    variability = "discrete" if row.unit is None else "continuous"
     common = (
-        f'name={quoteattr(row["name"])} valueReference="{row["vr"]}" description={quoteattr(row["text"])}'
-        f' causality="{row["causality"]}"'
+        f'name={quoteattr(row.name)} valueReference="{row.reference}" description={quoteattr(row.text)}'
+        f' causality="{row.causality}" variability="{variability}"{initial}'
     )
-    boolean = "unit" not in row
-    variability = ' variability="discrete"' if boolean else ' variability="continuous"'
-    value = ' start="false"' if boolean else f' unit="{row["unit"]}"'
-    value += f' start="{row["start"]!r}"' if "start" in row else ""
+    value = ' start="false"' if row.unit is None else f' unit="{row.unit}"'
+    value += f' start="{row.start!r}"' if row.start is not None else ""
     if fmi == 3:
-        return f"    <{'Boolean' if boolean else 'Float64'} {common}{variability}{kind}{value}/>"
-    element = "Boolean" if boolean else "Real"
-    return f"    <ScalarVariable {common}{variability}{kind}><{element}{value}/></ScalarVariable>"
+        return f"    <{'Boolean' if row.unit is None else 'Float64'} {common}{value}/>"
+    element = "Boolean" if row.unit is None else "Real"
+    return f"    <ScalarVariable {common}><{element}{value}/></ScalarVariable>"
 
 
 def model_description(fmi: int, token: str, parameters: WellParameters) -> str:
     """``modelDescription.xml`` for FMI 2.0 or 3.0."""
     rows = _variables(parameters)
-    variables = "\n".join(_variable_xml(row, fmi) for row in rows)
-    units = "\n".join(
+    outputs = [(i, row.reference) for i, row in enumerate(rows, 1) if row.causality == "output"]
+    if fmi == 2:
+        listed = "".join(f'<Unknown index="{i}"/>' for i, _ in outputs)
+    else:
+        kinds = ("Output", "InitialUnknown")
+        listed = "".join(f'<{kind} valueReference="{at}"/>' for kind in kinds for _, at in outputs)
+    units = (
         f'    <Unit name="{name}"><BaseUnit {base}/></Unit>'.replace(" />", "/>")
         for name, base in UNITS.items()
     )
-    text = "Gas-lifted oil well with two tubing sections, integrated with fixed steps of 1 s"
-    experiment = '<DefaultExperiment startTime="0" stopTime="78000" stepSize="10"/>'
-    sources = "".join(f'<File name="{name}"/>' for name in (f"fmi{fmi}.c", "well.c"))
-    outputs = [(i, row) for i, row in enumerate(rows, 1) if row["causality"] == "output"]
-    if fmi == 2:
-        listed = "".join(f'<Unknown index="{i}"/>' for i, _ in outputs)
-        return f"""<?xml version="1.0" encoding="UTF-8"?>
-<fmiModelDescription fmiVersion="2.0" modelName="GasLiftedWell" guid="{token}"
-  description="{text}" generationTool="jaxmpc" license="MIT" variableNamingConvention="structured">
-  <CoSimulation modelIdentifier="{MODEL_IDENTIFIER}" canHandleVariableCommunicationStepSize="true"
-    canGetAndSetFMUstate="true" canSerializeFMUstate="true">
-    <SourceFiles>{sources}</SourceFiles>
-  </CoSimulation>
-  <UnitDefinitions>
-{units}
-  </UnitDefinitions>
-  {experiment}
-  <ModelVariables>
-{variables}
-  </ModelVariables>
-  <ModelStructure>
-    <Outputs>{listed}</Outputs>
-    <InitialUnknowns>{listed}</InitialUnknowns>
-  </ModelStructure>
-</fmiModelDescription>
-"""
-    listed = "".join(f'<Output valueReference="{row["vr"]}"/>' for _, row in outputs)
-    listed += "".join(f'<InitialUnknown valueReference="{row["vr"]}"/>' for _, row in outputs)
-    return f"""<?xml version="1.0" encoding="UTF-8"?>
-<fmiModelDescription fmiVersion="3.0" modelName="GasLiftedWell" instantiationToken="{token}"
-  description="{text}" generationTool="jaxmpc" license="MIT" variableNamingConvention="structured">
-  <CoSimulation modelIdentifier="{MODEL_IDENTIFIER}" canHandleVariableCommunicationStepSize="true"
-    canGetAndSetFMUState="true" canSerializeFMUState="true"/>
-  <UnitDefinitions>
-{units}
-  </UnitDefinitions>
-  {experiment}
-  <ModelVariables>
-    <Float64 name="time" valueReference="{VR_TIME}" causality="independent" variability="continuous"
-      unit="s"/>
-{variables}
-  </ModelVariables>
-  <ModelStructure>{listed}</ModelStructure>
-</fmiModelDescription>
-"""
+    return _filled(
+        f"modelDescription{fmi}.xml",
+        token=token,
+        identifier=MODEL_IDENTIFIER,
+        sources="".join(f'<File name="{name}"/>' for name in (f"fmi{fmi}.c", "well.c")),
+        units="\n".join(units),
+        variables="\n".join(_variable_xml(row, fmi) for row in rows),
+        listed=listed,
+        time=VR_TIME,
+    )
 
 
-def _build_description(fmi: int) -> str:
-    sources = "".join(f'<SourceFile name="{name}"/>' for name in (f"fmi{fmi}.c", "well.c"))
-    return f"""<?xml version="1.0" encoding="UTF-8"?>
-<fmiBuildDescription fmiVersion="3.0">
-  <BuildConfiguration modelIdentifier="{MODEL_IDENTIFIER}">
-    <SourceFileSet language="C99">{sources}</SourceFileSet>
-  </BuildConfiguration>
-</fmiBuildDescription>
-"""
+def _filled(name: str, **words: object) -> str:
+    """A template of ``fmu_sources`` with its words filled in."""
+    return Template((files("identify") / "fmu_sources" / name).read_text("utf-8")).substitute(words)
 
 
 def fmu_files(fmi: int, parameters: WellParameters) -> tuple[dict[str, str], str]:
@@ -278,7 +232,10 @@ def fmu_files(fmi: int, parameters: WellParameters) -> tuple[dict[str, str], str
     }
     contents["sources/model.h"] = model_header(parameters)
     if fmi == 3:
-        contents["sources/buildDescription.xml"] = _build_description(fmi)
+        sources = "".join(f'<SourceFile name="{name}"/>' for name in (f"fmi{fmi}.c", "well.c"))
+        contents["sources/buildDescription.xml"] = _filled(
+            "buildDescription.xml", identifier=MODEL_IDENTIFIER, sources=sources
+        )
     body = repr(sorted(contents.items())) + model_description(fmi, "", parameters)
     digest = hashlib.sha256(body.encode()).hexdigest()
     token = "{" + "-".join((digest[:8], digest[8:12], digest[12:16], digest[16:20], digest[20:32])) + "}"

@@ -9,6 +9,7 @@ as those of the step choke, so that the curvature over one step is averaged and 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -53,12 +54,11 @@ def identify_schedule(
             raise InputError(key, list(values), "one or more distinct positions")
     if min(steps) <= 0:
         raise InputError("steps", steps, "two positive steps: choke [%] and lift [m3/h]")
-    models = []
-    for choke in chokes:
-        for lift in lifts:
-            models.append(both_ways(plant, float(choke), float(lift), steps, samples))
-            if progress is not None:
-                progress(len(models), len(chokes) * len(lifts))
+    models, points = [], list(itertools.product(chokes, lifts))
+    for choke, lift in points:
+        models.append(both_ways(plant, float(choke), float(lift), steps, samples))
+        if progress is not None:
+            progress(len(models), len(points))
     return make_schedule(models)
 
 

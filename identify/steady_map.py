@@ -8,17 +8,21 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from identify.step_test import identity
 from identify.sweep import steady_sweep
 from jaxmpc.process.plant import WellPlant
-from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS, well_hash
+from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS
 from jaxmpc.steady.map import SteadyMap
 
 CHOKES = np.arange(2.0, 101.0, 2.0)  # %, the positions of the step choke
 LIFTS = np.r_[0.0:2000.0:500.0, 2000.0:10_001.0:1000.0]  # m3/h, finer where the gain of the lift changes most
 
 
-def steady_map(plant: Any = None, chokes=None, lifts=None) -> SteadyMap:
+def steady_map(
+    plant: Any = None, chokes: ArrayLike | None = None, lifts: ArrayLike | None = None
+) -> SteadyMap:
     """Steady gas and oil rate over a grid of choke positions and lift rates.
 
     Args:
@@ -33,18 +37,18 @@ def steady_map(plant: Any = None, chokes=None, lifts=None) -> SteadyMap:
         InputError: for inputs outside their range or grids that do not increase.
     """
     plant = WellPlant() if plant is None else plant
-    chokes, lifts = CHOKES if chokes is None else chokes, np.atleast_1d(LIFTS if lifts is None else lifts)
+    chokes = np.asarray(CHOKES if chokes is None else chokes)
+    lifts = np.atleast_1d(LIFTS if lifts is None else lifts)
     sweeps = [steady_sweep(plant, chokes, [lift]) for lift in lifts]  # one shape: compiled once for any grid
     cv = np.concatenate([np.where(sweep.converged, sweep.cv, np.nan) for sweep in sweeps], axis=1)
-    kind = "jax" if isinstance(plant, WellPlant) else "fmu"
-    known = well_hash(plant.parameters) if isinstance(plant, WellPlant) else plant.token
+    kind, digest = identity(plant)
     return SteadyMap(
-        choke=np.asarray(chokes),
+        choke=chokes,
         lift=lifts,
         cv=cv,
         cv_names=CV_NAMES,
         mv_names=MV_NAMES,
         cv_units=CV_UNITS,
         mv_units=MV_UNITS,
-        provenance={"plant": kind, "hash": known},
+        provenance={"plant": kind, "hash": digest},
     )

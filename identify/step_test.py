@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import itertools
 from typing import Any, NamedTuple
 
 import jax
@@ -55,26 +56,26 @@ class Settling(NamedTuple):
 def settling(model: StepResponseModel) -> list[Settling]:
     """Whether each response of a model had settled by its last sample; see `Settling`."""
     found = []
-    for i, cv in enumerate(model.cv_names):
-        for j, mv in enumerate(model.mv_names):
-            s = np.asarray(model.coefficients[i, j])
-            peak = s[np.argmax(np.abs(s))]
-            tail = s[-max(2, len(s) // 10) :]
-            movement = float(np.ptp(tail) / max(abs(peak), 1e-300)) if len(s) > 1 else 1.0
-            outside = np.flatnonzero(np.abs(s - s[-1]) > 0.02 * abs(peak))
-            last = int(outside[-1]) + 1 if outside.size else 0
-            found.append(
-                Settling(
-                    cv,
-                    mv,
-                    movement < SETTLED_SHARE,
-                    movement,
-                    float(s[-1]),
-                    float(peak),
-                    (last + 1) * model.dt,
-                )
-            )
+    for (i, cv), (j, mv) in itertools.product(enumerate(model.cv_names), enumerate(model.mv_names)):
+        s = np.asarray(model.coefficients[i, j])
+        gain, peak = float(s[-1]), float(s[np.argmax(np.abs(s))])
+        tail = s[-max(2, len(s) // 10) :]
+        movement = float(np.ptp(tail) / max(abs(peak), 1e-300)) if len(s) > 1 else 1.0
+        outside = np.flatnonzero(np.abs(s - gain) > 0.02 * abs(peak))
+        time = (int(outside[-1]) + 2 if outside.size else 1) * model.dt
+        found.append(Settling(cv, mv, movement < SETTLED_SHARE, movement, gain, peak, time))
     return found
+
+
+def identity(plant: Any) -> tuple[str, str]:
+    """What a plant is, ``jax`` or ``fmu``, and a digest of everything that decides its responses.
+
+    Args:
+        plant: a `WellPlant`, or an `identify.fmu.FmuPlant`.
+    """
+    if isinstance(plant, WellPlant):
+        return "jax", well_hash(plant.parameters)
+    return "fmu", plant.token
 
 
 def settling_notes(model: StepResponseModel) -> list[str]:
@@ -159,9 +160,10 @@ def identify_step_response(
             )
         base = cv[SETTLE_SAMPLES - 1]
         responses.append((cv[SETTLE_SAMPLES:] - base).T / step)
+    kind, digest = identity(plant)
     facts = {
-        "plant": "jax" if isinstance(plant, WellPlant) else "fmu",
-        "plant_hash": well_hash(plant.parameters) if isinstance(plant, WellPlant) else plant.token,
+        "plant": kind,
+        "plant_hash": digest,
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "steps": [float(step) for step in steps],
     }

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxmpc.errors import InputError
 from jaxmpc.process.plant import STATE_SCALE, WellPlant, check_inputs, rates, steady_state
@@ -70,7 +71,9 @@ def _linearise(choke, lift, parameters):
     return jax.vmap(one)(choke, lift)
 
 
-def stability_map(parameters: WellParameters | None = None, chokes=None, lifts=None) -> Stability:
+def stability_map(
+    parameters: WellParameters | None = None, chokes: ArrayLike | None = None, lifts: ArrayLike | None = None
+) -> Stability:
     """Where the well oscillates, and whether an oscillation grows (casing heading, thesis 6.7).
 
     The shipped well has no growing oscillation. After a disturbance it swings back: from 2000 m3/h of lift on
@@ -88,22 +91,27 @@ def stability_map(parameters: WellParameters | None = None, chokes=None, lifts=N
     parameters = WellParameters() if parameters is None else parameters
     chokes = np.array([2, 5, 10, 20, 30, 50, 70, 100.0]) if chokes is None else np.asarray(chokes, np.float64)
     lifts = np.array([200, 500, 1000, 2000, 5000, 1e4]) if lifts is None else np.asarray(lifts, np.float64)
-    check_inputs(chokes, lifts)
-    lift_grid, choke_grid = np.meshgrid(lifts, chokes, indexing="ij")
-    matrices, converged = _linearise(
-        jnp.asarray(choke_grid.ravel()), jnp.asarray(lift_grid.ravel()), parameters
-    )
+    choke, lift = _grid(chokes, lifts)
+    matrices, converged = _linearise(jnp.asarray(choke), jnp.asarray(lift), parameters)
     if not np.all(converged):
         where = int(np.argmin(converged))
-        point = (choke_grid.ravel()[where], lift_grid.ravel()[where])
-        raise InputError("choke, gas_lift", point, "inputs [%, m3/h] with a steady state")
+        raise InputError(
+            "choke, gas_lift", (choke[where], lift[where]), "inputs [%, m3/h] with a steady state"
+        )
     modes = np.linalg.eigvals(np.asarray(matrices))
     swinging = np.abs(modes.imag) > 1e-3 * np.abs(modes)
     ratio = np.where(swinging, -modes.real / np.abs(modes), 1.0)
     least = np.argmin(ratio, axis=1)[:, None]
     frequency = np.take_along_axis(np.where(swinging, np.abs(modes.imag), 0.0), least, axis=1)
-    shaped = (v.reshape(choke_grid.shape) for v in (modes.real.max(axis=1), frequency, ratio.min(axis=1)))
-    return Stability(chokes, lifts, *shaped)
+    found = modes.real.max(axis=1), frequency, ratio.min(axis=1)
+    return Stability(chokes, lifts, *(values.reshape(len(lifts), len(chokes)) for values in found))
+
+
+def _grid(chokes: np.ndarray, lifts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Choke and lift of every point of a grid that is within their ranges, lift by lift."""
+    check_inputs(chokes, lifts)
+    lift, choke = np.meshgrid(lifts, chokes, indexing="ij")
+    return choke.ravel(), lift.ravel()
 
 
 @jax.jit
@@ -112,7 +120,7 @@ def _steady(choke, lift, parameters):
     return found.outputs.cv, found.converged
 
 
-def steady_sweep(plant: Any = None, chokes=None, lifts=LIFTS) -> SteadySweep:
+def steady_sweep(plant: Any = None, chokes: ArrayLike | None = None, lifts: ArrayLike = LIFTS) -> SteadySweep:
     """Steady states over a grid, and the step coefficients between neighbouring choke positions.
 
     Args:
@@ -126,20 +134,17 @@ def steady_sweep(plant: Any = None, chokes=None, lifts=LIFTS) -> SteadySweep:
     plant = WellPlant() if plant is None else plant
     chokes = np.arange(2.0, 101.0, 2.0) if chokes is None else np.asarray(chokes, dtype=np.float64)
     lifts = np.atleast_1d(np.asarray(lifts, dtype=np.float64))
-    check_inputs(chokes, lifts)
+    choke, lift = _grid(chokes, lifts)
     if chokes.ndim != 1 or len(chokes) < 2 or (np.diff(chokes) <= 0).any():
         raise InputError("chokes", chokes.tolist(), "two or more increasing positions [%]")
-    lift_grid, choke_grid = np.meshgrid(lifts, chokes, indexing="ij")
     if isinstance(plant, WellPlant):
-        cv, converged = _steady(
-            jnp.asarray(choke_grid.ravel()), jnp.asarray(lift_grid.ravel()), plant.parameters
-        )
-        cv, converged = np.asarray(cv), np.asarray(converged)
+        cv, converged = _steady(jnp.asarray(choke), jnp.asarray(lift), plant.parameters)
     else:
-        pairs = zip(choke_grid.ravel(), lift_grid.ravel(), strict=True)
-        settled = [(plant.init(float(c), float(q)).cv, plant.settled) for c, q in pairs]
-        cv, converged = np.array([row[0] for row in settled]), np.array([row[1] for row in settled])
-    cv = np.moveaxis(cv.reshape(*choke_grid.shape, 2), -1, 0)
-    return SteadySweep(
-        chokes, lifts, cv, np.diff(cv, axis=-1) / np.diff(chokes), converged.reshape(choke_grid.shape)
-    )
+        settled = [
+            (plant.init(float(c), float(q)).cv, plant.settled) for c, q in zip(choke, lift, strict=True)
+        ]
+        cv, converged = zip(*settled, strict=True)
+    shape = len(lifts), len(chokes)
+    cv = np.moveaxis(np.asarray(cv).reshape(*shape, 2), -1, 0)
+    coefficient = np.diff(cv, axis=-1) / np.diff(chokes)
+    return SteadySweep(chokes, lifts, cv, coefficient, np.asarray(converged).reshape(shape))

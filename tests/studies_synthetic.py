@@ -7,9 +7,10 @@ from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.model.step_response import make_model
 from studies.definition.comparison import ComparisonDefinition, ReferenceDefinition
 from studies.run.comparison import comparison_template
-from studies.thesis.comparison import CONTROLLERS
+from studies.thesis.catalogue import STUDIES
 
 DT = 10.0
+CONTROLLERS = STUDIES["thesis"](False, "jax").controllers
 REFERENCE = ReferenceDefinition((0.0, 2000.0), ((10_000.0, 150.0), (30_000.0, 300.0)), 4000.0)
 
 

@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import dataclasses
 import functools
-import os
-import sys
-from collections.abc import Callable, Iterable, Iterator
-
-import numpy as np
+from collections.abc import Callable
 
 from identify.step_test import identify_step_response
 from jaxmpc.loop.reference import Reference
 from jaxmpc.model.step_response import StepResponseModel
 from studies.bench.instances import MODES, Mode, Recordings
-from studies.bench.judge import LONG, REPEATS
-from studies.bench.peers import Peer, PeerAnswer, Solve
-from studies.bench.rows import Row
+from studies.bench.peers import Peer
 from studies.definition import references
 
 
@@ -127,64 +119,3 @@ class Context:
         """The closed loops that the problems come from."""
         reference = references.quick() if self.quick else references.thesis()
         return Recordings(self.model, reference, self.size.run, self.say)
-
-
-def asked(peer: Peer, context: Context, count: int) -> np.ndarray:
-    """Positions of the problems that a peer is asked, evenly spread: all, a few for a slow one, or none."""
-    most = min(count, round(peer.limit * context.size.peer_share))
-    return np.unique(np.linspace(0, count - 1, most).astype(int))
-
-
-def ask(
-    peer: Peer, context: Context, cases: Iterable[dict], tolerance: float
-) -> tuple[np.ndarray, list[PeerAnswer], list[np.ndarray | None]]:
-    """Let a peer solve problems.
-
-    Returns:
-        Seconds ``"problem"``, answers, and plans ``"block mv"`` [MV unit] or None.
-    """
-    limit = min(peer.hopeless, context.size.cut_off)
-    solve: Solve = peer.begin(tolerance, limit)
-    seconds, answers, plans = [], [], []
-    for case in cases:
-        form = peer.build(case)
-        taken: list[float] = []
-        with _silence():
-            if peer.keeps and not answers:
-                solve(form)  # sets up what is set up once
-            while not taken or (len(taken) < REPEATS and taken[0] < LONG):
-                answer = solve(form)
-                taken.append(answer.seconds)
-        seconds.append(float(np.median(taken)))
-        answers.append(answer)
-        plans.append(None if answer.z is None else form.moves(answer.z))
-    return np.array(seconds), answers, plans
-
-
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Drop what solvers print past Python, whatever they were told."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    kept = [os.dup(number) for number in (1, 2)]
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    try:
-        for number in (1, 2):
-            os.dup2(nowhere, number)
-        yield
-    finally:
-        ctypes.CDLL(None).fflush(None)  # what C still holds back
-        for number, before in zip((1, 2), kept, strict=True):
-            os.dup2(before, number)
-            os.close(before)
-        os.close(nowhere)
-
-
-def absent(peer: Peer, context: Context, section: str, name: str) -> Row | None:
-    """The row of a peer that is not installed or left out of this run, None for one that is asked."""
-    why = peer.missing()
-    if why is not None:
-        return Row(name=name, section=section, status="missing", note=why)
-    if not len(asked(peer, context, 1_000_000)):
-        return Row(name=name, section=section, status="not measured", note="too slow for this size of run")
-    return None

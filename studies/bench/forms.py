@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -79,53 +79,32 @@ def cv_units(n: SimpleNamespace, units: np.ndarray) -> np.ndarray:
     return size
 
 
-@dataclasses.dataclass
-class _Parts:
-    """What the forms share: numbers, units, matrix of the scaled deviations, rows and limits of the moves."""
-
-    n: SimpleNamespace
-    units: np.ndarray
-    size: np.ndarray
-    theta: np.ndarray  # "deviation move", CV-major; moves are block-major: block 0 of every MV first
-    gap: np.ndarray  # deviation without moves
-    rows: Any
-    row_low: np.ndarray
-    row_high: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    weight: np.ndarray  # P per sample and block
-
-    def per_cv(self, values) -> np.ndarray:
-        """One value per penalised prediction."""
-        return np.repeat(np.asarray(values, dtype=float), self.n.hp - self.n.hw + 1)
-
-
-def _parts(case: dict) -> _Parts:
-    n = read(case)
-    units = move_units(n)
-    size = cv_units(n, units)
-    blocks, single = len(n.blocks), n.blocking == "inputs"
-    counts = np.ones(blocks) if single else np.array(n.blocks, dtype=float)
-    spread = np.zeros((n.hu, blocks))  # block moves to sample moves (6.3)
+def _deviations(n: SimpleNamespace, units: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix of the scaled deviations ``"deviation move"`` and the deviations without moves; CV-major, block-major."""
+    spread = np.zeros((n.hu, len(n.blocks)))  # block moves to sample moves (6.3)
     for b, (start, length) in enumerate(zip(n.starts, n.blocks, strict=True)):
-        spread[start : start + (1 if single else length), b] = 1.0
+        spread[start : start + (1 if n.blocking == "inputs" else length), b] = 1.0
     lag = np.arange(n.hw, n.hp + 1)[:, None] - np.arange(n.hu)[None, :]  # S(j - k) of the move at k
-    theta = np.zeros((n.cvs, len(lag), blocks, n.mvs))
-    for c, m in np.ndindex(n.cvs, n.mvs):
-        delayed = np.where(lag > 0, n.S[c, m][np.maximum(lag - 1, 0)], 0.0)
-        theta[c, :, :, m] = delayed @ spread * units[m] / size[c]
+    delayed = np.where(lag > 0, n.S[:, :, np.maximum(lag - 1, 0)], 0.0)
+    theta = (delayed @ spread).transpose(0, 2, 3, 1) * units / size[:, None, None, None]
     gap = ((n.free - n.r)[n.hw - 1 :] / size).T.reshape(-1)
+    return theta.reshape(len(gap), -1), gap
 
+
+def _moves(n: SimpleNamespace, units: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Limits of the scaled moves ``"block mv"``, low and high, and rows over them ``"row move"`` with theirs."""
+    blocks = len(n.blocks)
     low, high = np.zeros((blocks, n.mvs)), np.zeros((blocks, n.mvs))
+    held = [n.blocking == "inputs" and length > 1 for length in n.blocks]  # zero moves follow in the block
     rows, row_low, row_high = [], [], []
 
-    def row(m, form, lower, upper):
-        if math.isfinite(lower) or math.isfinite(upper):
-            wide = np.zeros((blocks, n.mvs))
-            wide[:, m] = form
-            rows.append(wide.ravel())
-            row_low.append(lower)
-            row_high.append(upper)
+    def row(m: int, form: np.ndarray, lower: float, upper: float) -> None:
+        rows.append(np.outer(form, np.arange(n.mvs) == m).ravel())
+        row_low.append(lower)
+        row_high.append(upper)
+
+    def within(b: int, m: int, lower: float, upper: float) -> None:
+        low[b, m], high[b, m] = max(low[b, m], lower), min(high[b, m], upper)
 
     for m in range(n.mvs):
         if n.step[m]:
@@ -134,95 +113,73 @@ def _parts(case: dict) -> _Parts:
             dlo, dhi = n.dlo[m] / units[m], n.dhi[m] / units[m]
             plo, phi = (min(0.0, (n.ulo[m] - n.u0[m]) / units[m]), max(0.0, (n.uhi[m] - n.u0[m]) / units[m]))
         low[:, m], high[:, m] = dlo, dhi  # (5.5a)
-        low[0, m] = max(low[0, m], n.first_low[m] / units[m])
-        high[0, m] = min(high[0, m], n.first_high[m] / units[m])
+        within(0, m, n.first_low[m] / units[m], n.first_high[m] / units[m])
         for b in range(blocks):  # the ends of a block bound what lies between them
             row(m, np.where(np.arange(blocks) <= b, counts, 0.0), plo, phi)
-        if n.oscillation[m]:  # (6.16)
-            past = round(n.last[m] / n.step[m])
-            low[0, m], high[0, m] = max(low[0, m], past - 1.0), min(high[0, m], past + 1.0)
-            for b in range(1, blocks):
-                if single and n.blocks[b - 1] > 1:  # a zero move lies between
-                    low[b - 1, m], high[b - 1, m] = max(low[b - 1, m], -1.0), min(high[b - 1, m], 1.0)
-                    low[b, m], high[b, m] = max(low[b, m], -1.0), min(high[b, m], 1.0)
-                else:
-                    row(m, np.eye(blocks)[b] - np.eye(blocks)[b - 1], -1.0, 1.0)
-            if single and n.blocks[-1] > 1:
-                low[-1, m], high[-1, m] = max(low[-1, m], -1.0), min(high[-1, m], 1.0)
-    return _Parts(
-        n,
-        units,
-        size,
-        theta.reshape(-1, blocks * n.mvs),
-        gap,
-        sp.csr_matrix(np.array(rows).reshape(-1, blocks * n.mvs)),
-        np.array(row_low),
-        np.array(row_high),
-        low.ravel(),
-        high.ravel(),
-        (counts[:, None] * n.P * units**2).ravel(),
-    )
-
-
-def _limit_rows(parts: _Parts) -> tuple[np.ndarray, np.ndarray, sp.csr_matrix]:
-    """Scaled CV limits (high, low) as deviations, and which eps each prediction belongs to."""
-    n, horizon = parts.n, parts.n.hp - parts.n.hw + 1
-    priced = n.rho > 0  # a slack without price is as good as no limit
-    r = n.r[n.hw - 1 :]
-    high = np.where(priced, (n.yhi - r) / parts.size, np.inf).T.reshape(-1)
-    low = np.where(priced, (n.ylo - r) / parts.size, -np.inf).T.reshape(-1)
-    member = sp.csr_matrix(sp.kron(sp.identity(n.cvs), np.ones((horizon, 1))))
-    return high, low, member
-
-
-def _zeros(rows: int, columns: int) -> sp.csr_matrix:
-    return sp.csr_matrix((rows, columns))
+        if not n.oscillation[m]:
+            continue
+        past = round(n.last[m] / n.step[m])  # (6.16)
+        within(0, m, past - 1.0, past + 1.0)
+        for b in range(blocks):
+            if held[b] or (b and held[b - 1]):  # a zero move lies between
+                within(b, m, -1.0, 1.0)
+            if b and not held[b - 1]:
+                row(m, np.eye(blocks)[b] - np.eye(blocks)[b - 1], -1.0, 1.0)
+    return low, high, np.array(rows), np.array(row_low), np.array(row_high)
 
 
 def lifted(case: dict) -> Form:
     """Variables: block moves, deviations e = y - r, eps high, eps low, eta; diagonal Hessian."""
-    p = _parts(case)
-    n, k, d, cvs = p.n, p.theta.shape[1], len(p.gap), p.n.cvs
-    limit_high, limit_low, member = _limit_rows(p)
-    one, soft = sp.identity(d), p.per_cv((n.S2 + n.S1) > 0) > 0
-    none = _zeros(d, cvs)
-    never = np.full(d, np.inf)
-    edge = np.where(soft, p.per_cv(n.c / p.size), np.inf)
-    rows = [
-        ([-sp.csr_matrix(p.theta), one, none, none, _zeros(d, d)], p.gap, p.gap),  # (5.4c)
-        ([_zeros(d, k), one, -member, none, _zeros(d, d)], -never, limit_high),  # (5.5b)
-        ([_zeros(d, k), one, none, member, _zeros(d, d)], limit_low, never),
-        ([_zeros(d, k), one, none, none, -one], -never, edge),  # (6.12a)
-        ([_zeros(d, k), one, none, none, one], -edge, never),  # (6.12b)
-        (
-            [p.rows, _zeros(p.rows.shape[0], 2 * (d + cvs))],
-            p.row_low,
-            p.row_high,
-        ),
-    ]
-    size2 = p.size**2
-    diagonal = 2.0 * np.concatenate(
-        [p.weight, p.per_cv(n.Q * size2), np.zeros(2 * cvs), p.per_cv(n.S2 * size2)]
+    n = read(case)
+    units = move_units(n)
+    size = cv_units(n, units)
+    counts = np.ones(len(n.blocks)) if n.blocking == "inputs" else np.array(n.blocks, dtype=float)
+    theta, gap = _deviations(n, units, size)
+    move_low, move_high, move_rows, position_low, position_high = _moves(n, units, counts)
+    (d, k), horizon = theta.shape, n.hp - n.hw + 1
+
+    def each(values: np.ndarray) -> np.ndarray:
+        """One value per penalised prediction."""
+        return np.repeat(values.astype(float), horizon)
+
+    priced, setpoint = n.rho > 0, n.r[n.hw - 1 :]  # a slack without price is as good as no limit
+    limit_high = np.where(priced, (n.yhi - setpoint) / size, np.inf).T.ravel()
+    limit_low = np.where(priced, (n.ylo - setpoint) / size, -np.inf).T.ravel()
+    member = np.repeat(np.eye(n.cvs), horizon, axis=0)
+    one, soft, never = sp.identity(d), each((n.S2 + n.S1) > 0) > 0, np.full(d, np.inf)
+    edge = np.where(soft, each(n.c / size), np.inf)
+    A: Any = sp.bmat(
+        [
+            [-theta, one, None, None, None],  # (5.4c)
+            [None, one, -member, None, None],  # (5.5b)
+            [None, one, None, member, None],
+            [None, one, None, None, -one],  # (6.12a)
+            [None, one, None, None, one],  # (6.12b)
+            [move_rows, None, None, None, None],
+        ],
+        format="csr",
     )
-    price = n.rho * p.size
-    linear = np.concatenate([np.zeros(k + d), price, price, p.per_cv(n.S1 * p.size)])
-    eps_high = np.where(np.isfinite(n.yhi) & (n.rho > 0), np.inf, 0.0)
-    eps_low = np.where(np.isfinite(n.ylo) & (n.rho > 0), np.inf, 0.0)
-    low = np.concatenate([p.low, np.full(d, -np.inf), np.zeros(2 * cvs + d)])
-    high = np.concatenate([p.high, np.full(d, np.inf), eps_high, eps_low, np.where(soft, np.inf, 0.0)])
-    A: Any = sp.csr_matrix(sp.vstack([sp.hstack(blocks) for blocks, _, _ in rows]))
-    row_low, row_high = (np.concatenate([entry[i] for entry in rows]) for i in (1, 2))
+    row_low = np.concatenate([gap, -never, limit_low, -never, -edge, position_low])
+    row_high = np.concatenate([gap, limit_high, never, edge, never, position_high])
     keep = np.isfinite(row_low) | np.isfinite(row_high)
+    weights = (
+        (counts[:, None] * n.P * units**2).ravel(),
+        each(n.Q * size**2),
+        np.zeros(2 * n.cvs),
+        each(n.S2 * size**2),
+    )
+    price, none = n.rho * size, np.zeros(n.cvs)
+    upper = [np.where(np.isfinite(limit) & priced, np.inf, 0.0) for limit in (n.yhi, n.ylo)]
     return Form(
-        P=sp.csc_matrix(sp.diags(diagonal)),
-        c=linear,
-        A=sp.csr_matrix(A[keep]),
+        P=sp.csc_matrix(sp.diags(2.0 * np.concatenate(weights))),
+        c=np.concatenate([np.zeros(k + d), price, price, each(n.S1 * size)]),
+        A=A[keep],
         row_low=row_low[keep],
         row_high=row_high[keep],
-        low=low,
-        high=high,
+        low=np.concatenate([move_low.ravel(), -never, none, none, np.zeros(d)]),
+        high=np.concatenate([move_high.ravel(), never, *upper, np.where(soft, np.inf, 0.0)]),
         starts=np.arange(k).reshape(len(n.blocks), n.mvs),
-        units=p.units,
+        units=units,
         integer=np.array([step is not None for step in n.step]),
     )
 
@@ -236,27 +193,24 @@ def dense(case: dict) -> Form:
     keep = np.r_[np.arange(k), np.arange(k + d, len(form.c))]
     rest, deviation = form.A[d:], form.A[d:, k : k + d]
     weight = form.P.diagonal()[k : k + d]
-    hessian = form.P[keep][:, keep].tolil()
+    hessian, linear, rows = form.P[keep][:, keep].tolil(), form.c[keep], rest[:, keep].tolil()
     hessian[:k, :k] += (theta.T @ sp.diags(weight) @ theta).toarray()
-    linear = form.c[keep].copy()
     linear[:k] += theta.T @ (weight * gap)
-    A = sp.csr_matrix(rest[:, keep] + sp.hstack([deviation @ theta, _zeros(rest.shape[0], len(keep) - k)]))
+    rows[:, :k] += (deviation @ theta).toarray()
     moved = deviation @ gap
-    return Form(
-        sp.csc_matrix(hessian),
-        linear,
-        A,
-        form.row_low[d:] - moved,
-        form.row_high[d:] - moved,
-        form.low[keep],
-        form.high[keep],
-        form.starts,
-        form.units,
-        form.integer,
+    return dataclasses.replace(
+        form,
+        P=sp.csc_matrix(hessian),
+        c=linear,
+        A=sp.csr_matrix(rows),
+        row_low=form.row_low[d:] - moved,
+        row_high=form.row_high[d:] - moved,
+        low=form.low[keep],
+        high=form.high[keep],
     )
 
 
-def rows_of(form: Form, boxes: bool = False):
+def rows_of(form: Form, boxes: bool = False) -> tuple[Any, np.ndarray, Any, np.ndarray, np.ndarray]:
     """Equations (A, b) and inequalities (G, l, u); with `boxes` the limits of the variables are among them."""
     A, low, high = form.A, form.row_low, form.row_high
     if boxes:
@@ -269,24 +223,18 @@ def rows_of(form: Form, boxes: bool = False):
 
 def same_matrices(one: Form | None, other: Form) -> bool:
     """Whether only vectors differ, so that a solver may keep what it made of the matrices."""
-    if one is None or one.A.shape != other.A.shape or one.P.nnz != other.P.nnz:
+
+    def matrices(form: Form) -> list[np.ndarray]:
+        limits = np.r_[form.low, form.high, form.row_low, form.row_high]
+        fixed = form.low == form.high, form.row_low == form.row_high
+        return [form.A.indices, form.A.data, form.P.data, *fixed, np.isfinite(limits)]
+
+    if one is None or one.A.shape != other.A.shape:
         return False
-    kinds = [
-        np.r_[
-            f.low == f.high, f.row_low == f.row_high, np.isfinite([*f.low, *f.high, *f.row_low, *f.row_high])
-        ]
-        for f in (one, other)
-    ]
-    return (
-        np.array_equal(*kinds)
-        and np.array_equal(one.A.indices, other.A.indices)
-        and np.array_equal(one.A.data, other.A.data)
-        and np.array_equal(one.P.data, other.P.data)
-    )
+    return all(np.array_equal(a, b) for a, b in zip(matrices(one), matrices(other), strict=True))
 
 
-@dataclasses.dataclass
-class Binaries:
+class Binaries(NamedTuple):
     """Integers written as their lower limit plus binaries: z = back @ x + base."""
 
     back: sp.csr_matrix
@@ -298,28 +246,21 @@ def binaries_of(form: Form) -> tuple[Form, Binaries | None]:
     """The form with every integer as a sum of binaries; untouched where there are none."""
     if not len(form.integers):
         return form, None
-    count = len(form.c)
-    owner: list[int] = []
-    base = np.zeros(count)
-    for i in form.integers:
-        base[i] = form.low[i]
-        owner += [int(i)] * int(form.high[i] - form.low[i])
-    kept = np.setdiff1d(np.arange(count), form.integers)
-    back = sp.csr_matrix(
-        (
-            np.ones(len(kept) + len(owner)),
-            (np.r_[kept, np.array(owner, dtype=int)], np.arange(len(kept) + len(owner))),
-        ),
-        shape=(count, len(kept) + len(owner)),
-    )
-    moved = form.A @ base
-    return dataclasses.replace(
+    base = np.zeros(len(form.c))
+    base[form.integers] = form.low[form.integers]
+    ranges = (form.high - form.low)[form.integers].astype(int)
+    kept = np.setdiff1d(np.arange(len(form.c)), form.integers)
+    owner = np.r_[kept, np.repeat(form.integers, ranges)]  # of every new variable
+    back = sp.csr_matrix((np.ones(len(owner)), (owner, np.arange(len(owner)))), (len(form.c), len(owner)))
+    binary, moved = np.arange(len(kept), len(owner)), form.A @ base
+    changed = dataclasses.replace(
         form,
         P=sp.csc_matrix(back.T @ form.P @ back),
         c=back.T @ (form.c + form.P @ base),
         A=sp.csr_matrix(form.A @ back),
         row_low=form.row_low - moved,
         row_high=form.row_high - moved,
-        low=np.r_[form.low[kept], np.zeros(len(owner))],
-        high=np.r_[form.high[kept], np.ones(len(owner))],
-    ), Binaries(back, base, len(kept) + np.arange(len(owner)))
+        low=np.r_[form.low[kept], np.zeros(len(binary))],
+        high=np.r_[form.high[kept], np.ones(len(binary))],
+    )
+    return changed, Binaries(back, base, binary)

@@ -12,9 +12,8 @@ import io
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,12 +24,12 @@ from jaxmpc.controller.mixed_integer import MixedIntegerController
 from jaxmpc.files import write_atomically
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import simulate
-from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
 from jaxmpc.process.plant import WellPlant
 from jaxmpc.process.well.equations import well_hash
+from jaxmpc.process.well.host import HostWell
 from jaxmpc.programs.cache import cache_folder, read_sealed, sealed
 from studies.definition import presets
 from studies.store.fingerprint import content_hash
@@ -66,8 +65,7 @@ class Recording:
     wall_time: float
 
 
-@dataclasses.dataclass(frozen=True)
-class Problems:
+class Problems(NamedTuple):
     """Problems of single samples, ``"problem"`` first; values as `jaxmpc.problem.condense.make_instance` takes them."""
 
     free_response: np.ndarray
@@ -76,12 +74,13 @@ class Problems:
     last_move: np.ndarray
     past_moves: np.ndarray
 
-    def __len__(self) -> int:
-        return len(self.mv_now)
+    def take(self, index: int | np.ndarray) -> Problems:
+        """Some of the problems."""
+        return Problems(*(values[index] for values in self))
 
     def at(self, i: int) -> dict[str, Any]:
         """One problem by the names of `Planner.solve`."""
-        return {field.name: getattr(self, field.name)[i] for field in dataclasses.fields(self)}
+        return self.take(i)._asdict()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,6 +103,10 @@ class Instances:
     def __len__(self) -> int:
         return len(self.sample)
 
+    def cases(self) -> list[dict[str, Any]]:
+        """The contents of all case files."""
+        return [self.case(i) for i in range(len(self))]
+
     def case(self, i: int) -> dict[str, Any]:
         """The content of a case file, with the limits of the first move that the mean-move limit (6.6) sets."""
         problem = self.now.at(i)
@@ -113,24 +116,6 @@ class Instances:
         body["first_move_high"] = np.where(mean > limit, 0.0, np.inf).tolist()
         body["first_move_low"] = np.where(mean < -limit, 0.0, -np.inf).tolist()
         return body
-
-
-class SteppedWell:
-    """The JAX well stepped from the host, so that every sample of the loop has its own solve time."""
-
-    def __init__(self, plant: WellPlant):
-        self.plant, self.dt = plant, plant.dt
-        self._step = eqx.filter_jit(WellPlant.step)
-
-    def init(self):
-        """Steady state at the default working point; returns its outputs."""
-        self.state = self.plant.init()
-        return self.plant.measure(self.state)
-
-    def step(self, mv, disturbance: float = 0.0):
-        """One sample; returns the outputs at its end."""
-        self.state, outputs = self._step(self.plant, self.state, jnp.asarray(mv), jnp.asarray(disturbance))
-        return outputs
 
 
 def make_controller(kind: Kind, mode: Mode, model: StepResponseModel) -> Any:
@@ -165,11 +150,13 @@ class Recordings:
         """The run made now, once per benchmark: its times are of this machine and code."""
         if (kind, mode) not in self._live:
             self.say(f"{kind} run, {mode}, stepped from the host")
-            made = self._run(kind, mode, SteppedWell(WellPlant(actuator="step")))
+            made = self._run(kind, mode, HostWell(WellPlant(actuator="step")))
             self._live[kind, mode] = made
             path = self.path(kind, mode)
             if _load(path) is None:
-                write_atomically(path, _bytes(made))
+                buffer = io.BytesIO()
+                np.savez_compressed(buffer, **dataclasses.asdict(made))
+                write_atomically(path, sealed(buffer.getvalue()))
         return self._live[kind, mode]
 
     def compiled(self, kind: Kind, mode: Mode) -> Recording:
@@ -183,7 +170,8 @@ class Recordings:
         simulate(controller, plant, self.reference, samples=WARM_UP)
         begin = time.perf_counter()
         run = simulate(controller, plant, self.reference, samples=self.samples)
-        return _recording(run, time.perf_counter() - begin)
+        wall_time = time.perf_counter() - begin
+        return Recording(**{name: getattr(run, name) for name in FIELDS}, wall_time=wall_time)
 
     def path(self, kind: Kind, mode: Mode) -> Path:
         """File of a recording, named by its content key."""
@@ -229,8 +217,8 @@ class Recordings:
             controller.tuning,
             self.model,
             chosen,
-            _take(problems, chosen),
-            _take(problems, chosen - 1),
+            problems.take(chosen),
+            problems.take(chosen - 1),
         )
 
 
@@ -258,20 +246,6 @@ def replay(controller, recording: Recording) -> Problems:
     free, now, last, past = jax.tree.map(np.asarray, run(start, recording.cv, recording.move))
     setpoint = np.broadcast_to(recording.setpoint[:, None, :], free.shape)
     return Problems(free, setpoint, now, last, past)
-
-
-def _take(problems: Problems, index: np.ndarray) -> Problems:
-    return Problems(*(getattr(problems, field.name)[index] for field in dataclasses.fields(problems)))
-
-
-def _recording(run: Trajectory, wall_time: float) -> Recording:
-    return Recording(**{name: getattr(run, name) for name in FIELDS}, wall_time=wall_time)
-
-
-def _bytes(recording: Recording) -> bytes:
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **dataclasses.asdict(recording))
-    return sealed(buffer.getvalue())
 
 
 def _load(path: Path) -> Recording | None:

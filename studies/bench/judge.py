@@ -2,41 +2,49 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeVar
 
 import numpy as np
 
 from studies.bench.problem import objective, violation
 
+S = TypeVar("S")
+T = TypeVar("T")
 FEASIBLE = 1e-8  # of `problem.violation`: a plan beyond it may be cheaper than the optimum
 LEAST_COST = 1e-3  # costs below it are compared absolutely
 REPEATS = 3
 LONG = 0.1  # s; what takes longer is timed once
 
 
-def time_each(solve: Callable[[int], Any], count: int) -> tuple[np.ndarray, list[Any]]:
-    """Wall time of every call: the median of three where one is short.
+def taken(call: Callable[[], T]) -> tuple[float, T]:
+    """Seconds of a call by the clock on the wall, and its result."""
+    begin = time.perf_counter()
+    result = call()
+    return time.perf_counter() - begin, result
+
+
+def repeated(measure: Callable[[], tuple[float, T]]) -> tuple[float, T]:
+    """The median of three measured times where one is short, and the last result.
 
     Args:
-        solve: of a position; blocks until its result is there.
-        count: positions.
-
-    Returns:
-        Seconds ``"position"``, and the last result of each.
+        measure: seconds and result of one call; blocks until the result is there.
     """
-    seconds, results = np.zeros(count), []
-    for i in range(count):
-        taken = []
-        while not taken or (len(taken) < REPEATS and taken[0] < LONG):
-            begin = time.perf_counter()
-            result = solve(i)
-            taken.append(time.perf_counter() - begin)
-        seconds[i] = np.median(taken)
-        results.append(result)
-    return seconds, results
+    times: list[float] = []
+    while True:
+        seconds, result = measure()
+        times.append(seconds)
+        if len(times) == REPEATS or times[0] >= LONG:
+            return float(np.median(times)), result
+
+
+def time_each(solve: Callable[[S], T], problems: Iterable[S]) -> tuple[np.ndarray, list[T]]:
+    """Time and result of every problem, ``"problem"`` [s]; `repeated` says how."""
+    found = [repeated(functools.partial(taken, functools.partial(solve, one))) for one in problems]
+    return np.array([seconds for seconds, _ in found]), [result for _, result in found]
 
 
 class Judge:
@@ -64,11 +72,10 @@ class Judge:
         where = np.arange(len(plans)) if at is None else np.asarray(at, dtype=int)
         costs, wrongs = np.full(len(plans), math.nan), np.full(len(plans), math.nan)
         for place, (i, plan) in enumerate(zip(where, plans, strict=True)):
-            if plan is None or not np.isfinite(plan).all():
-                continue
-            costs[place], wrongs[place] = objective(self.cases[i], plan), violation(self.cases[i], plan)
-            if wrongs[place] <= FEASIBLE:
-                self.best[i] = min(self.best[i], costs[place])
+            if plan is not None and np.isfinite(plan).all():
+                costs[place], wrongs[place] = objective(self.cases[i], plan), violation(self.cases[i], plan)
+                if wrongs[place] <= FEASIBLE:
+                    self.best[i] = min(self.best[i], costs[place])
         self._seen[who] = where, costs, wrongs
 
     def errors(self, who: str) -> np.ndarray:

@@ -64,8 +64,7 @@ class Lanes:
                 recover=True,
             )
 
-        data = (getattr(problems, name) for name in Problems.__dataclass_fields__)
-        return jax.jit(jax.vmap(one))(*(jnp.asarray(values) for values in data))
+        return jax.jit(jax.vmap(one))(*(jnp.asarray(values) for values in problems))
 
     def _repeat(self, tree, count: int):
         return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], count, axis=0), tree)

@@ -12,7 +12,6 @@ import importlib
 import importlib.metadata
 import importlib.util
 import math
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -22,6 +21,7 @@ import scipy.sparse as sp
 from jaxmpc.integer.highs import solve_qp as highs_qp
 from studies.bench import forms
 from studies.bench.forms import Form, binaries_of, rows_of, same_matrices
+from studies.bench.judge import taken
 
 HUGE = 1e30  # what solvers without infinity call infinite
 
@@ -52,8 +52,7 @@ class Peer:
 
     Attributes:
         name: as printed.
-        package: distribution on the package index that brings it.
-        module: what is imported.
+        package: distribution on the package index that brings it, imported under the same name.
         build: the form it is fastest with.
         begin: ``(tolerance, seconds per solve) -> solve``; keeps what it may keep between samples.
         timed: what its time covers, for the table.
@@ -64,7 +63,6 @@ class Peer:
 
     name: str
     package: str
-    module: str
     build: Callable[[dict], Form]
     begin: Callable[[float, float], Solve]
     timed: str
@@ -74,7 +72,7 @@ class Peer:
 
     def missing(self) -> str | None:
         """Why it cannot be used, None if it can."""
-        if importlib.util.find_spec(self.module) is None:
+        if importlib.util.find_spec(self.package.replace("-", "_")) is None:
             return f"{self.package} is not installed (pip install 'jaxmpc[bench]')"
         return None
 
@@ -89,11 +87,56 @@ class Peer:
 # ------------------------------------------------------------------------------------------------ relaxed QPs
 
 
+class _Kept:
+    """A solver that is set up once for samples with equal matrices, and only given their vectors from then on.
+
+    Args:
+        setup: makes a solver of a form and its data.
+        update: gives the vectors of the data to one.
+        run: solves; returns what it found.
+    """
+
+    def __init__(self, setup: Callable[..., Any], update: Callable[..., object], run: Callable[[Any], Any]):
+        self.setup, self.update, self.run = setup, update, run
+        self.form: Form | None = None
+        self.solver: Any = None
+
+    def __call__(self, form: Form, *data: Any) -> tuple[float, Any]:
+        """Seconds of the solver's own work, and what it found."""
+        keep = same_matrices(self.form, form)
+
+        def work() -> Any:
+            if keep:
+                self.update(self.solver, form, *data)
+            else:
+                self.solver = self.setup(form, *data)
+            return self.run(self.solver)
+
+        found = taken(work)
+        self.form = form
+        return found
+
+
 def piqp(tolerance: float, seconds: float) -> Solve:
     """PIQP with sparse matrices: proximal interior point."""
     import piqp
 
-    held: dict[str, Any] = {"form": None}
+    def setup(form: Form, A: Any, G: Any, vectors: dict[str, np.ndarray]) -> Any:
+        solver = piqp.SparseSolver()
+        chosen = solver.settings
+        chosen.eps_abs = chosen.eps_rel = tolerance
+        chosen.check_duality_gap = True
+        chosen.eps_duality_gap_abs = chosen.eps_duality_gap_rel = tolerance
+        chosen.max_iter = 500
+        c, b, *limits = vectors.values()
+        solver.setup(form.P, c, A, b, G, *limits)
+        return solver
+
+    kept = _Kept(
+        setup,
+        lambda solver, form, A, G, vectors: solver.update(**vectors),
+        lambda solver: (solver.solve(), solver.result),
+    )
 
     def solve(form: Form) -> PeerAnswer:
         A, b, G, low, high = rows_of(form)
@@ -102,29 +145,12 @@ def piqp(tolerance: float, seconds: float) -> Solve:
         A: Any = sp.vstack([A, identity[fixed]])
         b, box_low, box_high = np.r_[b, form.low[fixed]], form.low.copy(), form.high.copy()
         box_low[fixed], box_high[fixed] = -math.inf, math.inf
-        keep = same_matrices(held["form"], form)
-        vectors = dict(c=form.c, b=b, h_l=low, h_u=high, x_l=box_low, x_u=box_high)
-        matrices = form.P, A.tocsc(), G.tocsc()
-        begin = time.perf_counter()
-        if keep:
-            solver = held["solver"]
-            solver.update(**vectors)
-        else:
-            solver = piqp.SparseSolver()
-            chosen = solver.settings
-            chosen.eps_abs = chosen.eps_rel = tolerance
-            chosen.check_duality_gap = True
-            chosen.eps_duality_gap_abs = chosen.eps_duality_gap_rel = tolerance
-            chosen.max_iter = 500
-            P, A, G = matrices
-            solver.setup(P, form.c, A, b, G, low, high, box_low, box_high)
-        status = solver.solve()
-        elapsed = time.perf_counter() - begin
-        held.update(form=form, solver=solver)
+        vectors = {"c": form.c, "b": b, "h_l": low, "h_u": high, "x_l": box_low, "x_u": box_high}
+        elapsed, (status, result) = kept(form, A.tocsc(), G.tocsc(), vectors)
         if status != piqp.PIQP_SOLVED:
             infeasible = status == piqp.PIQP_PRIMAL_INFEASIBLE
             return PeerAnswer("infeasible" if infeasible else "failed", seconds=elapsed)
-        return PeerAnswer("optimal", np.array(solver.result.x), solver.result.info.dual_obj, elapsed)
+        return PeerAnswer("optimal", np.array(result.x), result.info.dual_obj, elapsed)
 
     return solve
 
@@ -134,29 +160,20 @@ def clarabel(tolerance: float, seconds: float) -> Solve:
     import clarabel
 
     library: Any = clarabel  # its compiled names are unknown to type checkers
-    held: dict[str, Any] = {"form": None}
+    settings = library.DefaultSettings()
+    settings.verbose, settings.max_iter, settings.time_limit = False, 200, seconds
+    settings.presolve_enable = False  # so that vectors can be updated
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
+    kept = _Kept(
+        lambda form, upper, M, right, cones: library.DefaultSolver(upper, form.c, M, right, cones, settings),
+        lambda solver, form, upper, M, right, cones: solver.update(q=form.c, b=right),
+        lambda solver: solver.solve(),
+    )
 
     def solve(form: Form) -> PeerAnswer:
-        A, b, G, low, high = rows_of(form, boxes=True)
-        has_low, has_high = np.isfinite(low), np.isfinite(high)
-        M = sp.vstack([A, G[has_high], -G[has_low]], format="csc")
-        right = np.r_[b, high[has_high], -low[has_low]]
-        settings = library.DefaultSettings()
-        settings.verbose, settings.max_iter, settings.time_limit = False, 200, seconds
-        settings.presolve_enable = False  # so that vectors can be updated
-        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
-        cones = [library.ZeroConeT(len(b)), library.NonnegativeConeT(len(right) - len(b))]
-        upper = sp.triu(form.P, format="csc")
-        keep = same_matrices(held["form"], form)
-        begin = time.perf_counter()
-        if keep:
-            solver = held["solver"]
-            solver.update(q=form.c, b=right)
-        else:
-            solver = library.DefaultSolver(upper, form.c, M, right, cones, settings)
-        found = solver.solve()
-        elapsed = time.perf_counter() - begin
-        held.update(form=form, solver=solver)
+        M, right, equations = _standard(form)
+        cones = [library.ZeroConeT(equations), library.NonnegativeConeT(len(right) - equations)]
+        elapsed, found = kept(form, sp.triu(form.P, format="csc"), M, right, cones)
         status = str(found.status)
         if status in ("Solved", "AlmostSolved"):
             return PeerAnswer("optimal", np.array(found.x), found.obj_val_dual, elapsed)
@@ -169,28 +186,25 @@ def osqp(tolerance: float, seconds: float) -> Solve:
     """OSQP: operator splitting; polished, and stopped at 1e-6 as it rarely gets further."""
     import osqp  # pyright: ignore[reportMissingImports]
 
-    held: dict[str, Any] = {"form": None}
+    within = max(tolerance, 1e-6)
+    options = {"eps_abs": within, "eps_rel": within, "time_limit": seconds, "max_iter": 20_000}
+
+    def setup(form: Form, upper: Any, A: Any, low: np.ndarray, high: np.ndarray) -> Any:
+        solver = osqp.OSQP()
+        solver.setup(upper, form.c, A, low, high, verbose=False, polishing=True, **options)
+        return solver
+
+    def update(solver: Any, form: Form, upper: Any, A: Any, low: np.ndarray, high: np.ndarray) -> None:
+        solver.warm_start(x=np.zeros(len(form.c)), y=np.zeros(len(low)))  # the samples are no neighbours
+        solver.update(q=form.c, l=low, u=high)
+
+    kept = _Kept(setup, update, lambda solver: solver.solve(raise_error=False))
 
     def solve(form: Form) -> PeerAnswer:
         A = sp.vstack([form.A, sp.identity(len(form.c))], format="csc")
         low = np.maximum(np.r_[form.row_low, form.low], -HUGE)
         high = np.minimum(np.r_[form.row_high, form.high], HUGE)
-        upper = sp.triu(form.P, format="csc")
-        keep = same_matrices(held["form"], form)
-        limits = dict(eps_abs=max(tolerance, 1e-6), eps_rel=max(tolerance, 1e-6), time_limit=seconds)
-        begin = time.perf_counter()
-        if keep:
-            solver = held["solver"]
-            solver.warm_start(x=np.zeros(len(form.c)), y=np.zeros(len(low)))  # the samples are no neighbours
-            solver.update(q=form.c, l=low, u=high)
-        else:
-            solver = osqp.OSQP()
-            solver.setup(
-                upper, form.c, A, low, high, verbose=False, polishing=True, max_iter=20_000, **limits
-            )
-        found = solver.solve(raise_error=False)
-        elapsed = time.perf_counter() - begin
-        held.update(form=form, solver=solver)
+        elapsed, found = kept(form, sp.triu(form.P, format="csc"), A, low, high)
         if found.x is None or not np.isfinite(found.x).all():
             return PeerAnswer("failed", seconds=elapsed)
         good = found.info.status in ("solved", "solved inaccurate")
@@ -215,21 +229,12 @@ def daqp(tolerance: float, seconds: float) -> Solve:
             sense[spread.binary] = 16
         hessian = np.ascontiguousarray(form.P.toarray())
         options = dict(primal_tol=max(tolerance, 1e-10), dual_tol=1e-11, eps_prox=1e-4, iter_limit=100_000)
-        begin = time.perf_counter()
-        x, _, flag, _ = daqp.solve(
-            hessian, form.c.copy(), rows, upper, lower, sense, time_limit=seconds, **options
-        )
-        elapsed = time.perf_counter() - begin
-        if flag in (
-            1,
-            2,
-            4,
-        ):  # 4: solved, but the proximal term leaves its certificate open; the judge decides
-            z = np.array(x)[: len(form.c)]
-            return PeerAnswer(
-                "optimal", z if spread is None else spread.back @ z + spread.base, seconds=elapsed
-            )
-        return PeerAnswer("infeasible" if flag == -1 else "limit", seconds=elapsed)
+        problem = hessian, form.c.copy(), rows, upper, lower, sense
+        elapsed, (x, _, flag, _) = taken(lambda: daqp.solve(*problem, time_limit=seconds, **options))
+        if flag not in (1, 2, 4):  # 4: solved, but its certificate is left open; the judge decides
+            return PeerAnswer("infeasible" if flag == -1 else "limit", seconds=elapsed)
+        z = np.array(x)[: len(form.c)]
+        return PeerAnswer("optimal", z if spread is None else spread.back @ z + spread.base, seconds=elapsed)
 
     return solve
 
@@ -238,11 +243,9 @@ def highs(tolerance: float, seconds: float) -> Solve:
     """The QP solver of HiGHS: primal active set."""
 
     def solve(form: Form) -> PeerAnswer:
-        begin = time.perf_counter()
-        status, z = highs_qp(
-            form.P, form.c, form.A, form.row_low, form.row_high, form.low, form.high, seconds=seconds
-        )
-        return PeerAnswer(status, z, seconds=time.perf_counter() - begin)
+        data = form.P, form.c, form.A, form.row_low, form.row_high, form.low, form.high
+        elapsed, (status, z) = taken(lambda: highs_qp(*data, seconds=seconds))
+        return PeerAnswer(status, z, seconds=elapsed)
 
     return solve
 
@@ -257,21 +260,25 @@ def qpax(tolerance: float, seconds: float) -> Solve:
     ready: set[tuple[int, ...]] = set()
 
     def solve(form: Form) -> PeerAnswer:
-        A, b, G, low, high = rows_of(form, boxes=True)
-        has_low, has_high = np.isfinite(low), np.isfinite(high)
-        rows = sp.vstack([G[has_high], -G[has_low]]).toarray()
-        right = np.r_[high[has_high], -low[has_low]]
-        data = [jnp.asarray(v) for v in (form.P.toarray(), form.c, A.toarray(), b, rows, right)]
-        if rows.shape not in ready:
+        M, right, n = _standard(form)
+        M = M.toarray()
+        data = [jnp.asarray(v) for v in (form.P.toarray(), form.c, M[:n], right[:n], M[n:], right[n:])]
+        if M.shape not in ready:
             jax.block_until_ready(run(*data))
-            ready.add(rows.shape)
-        begin = time.perf_counter()
-        found: Any = jax.block_until_ready(run(*data))
-        elapsed = time.perf_counter() - begin
+            ready.add(M.shape)
+        elapsed, found = taken(lambda: jax.block_until_ready(run(*data)))
         z, converged = np.asarray(found[0]), bool(found[4])
         return PeerAnswer("optimal" if converged else "limit", z, seconds=elapsed)
 
     return solve
+
+
+def _standard(form: Form) -> tuple[Any, np.ndarray, int]:
+    """All rows as M z = right for the first so many, M z <= right for the others."""
+    A, b, G, low, high = rows_of(form, boxes=True)
+    has_low, has_high = np.isfinite(low), np.isfinite(high)
+    M = sp.vstack([A, G[has_high], -G[has_low]], format="csc")
+    return M, np.r_[b, high[has_high], -low[has_low]], len(b)
 
 
 # ---------------------------------------------------------------------------------------------- exact MIQPs
@@ -284,27 +291,17 @@ def scip(tolerance: float, seconds: float) -> Solve:
     def solve(form: Form) -> PeerAnswer:
         model = pyscipopt.Model()
         model.hideOutput()
-        for name, value in (
-            ("limits/time", seconds),
-            ("limits/gap", tolerance),
-            ("numerics/feastol", 1e-8),
-        ):
+        limits = {"limits/time": seconds, "limits/gap": tolerance, "numerics/feastol": 1e-8}
+        for name, value in limits.items():
             model.setParam(name, value)
         integer = set(form.integers.tolist())
         z = [
-            model.addVar(
-                vtype="I" if i in integer else "C",
-                lb=low if math.isfinite(low) else None,
-                ub=high if math.isfinite(high) else None,
-            )
+            model.addVar(vtype="I" if i in integer else "C", lb=_finite(low), ub=_finite(high))
             for i, (low, high) in enumerate(zip(form.low, form.high, strict=True))
         ]
-        for r in range(form.A.shape[0]):
-            part = slice(form.A.indptr[r], form.A.indptr[r + 1])
-            terms = pyscipopt.quicksum(
-                float(v) * z[k] for k, v in zip(form.A.indices[part], form.A.data[part], strict=True)
-            )
-            low, high = form.row_low[r], form.row_high[r]
+        for row, low, high in zip(form.A, form.row_low, form.row_high, strict=True):
+            entries = zip(row.indices, row.data, strict=True)
+            terms = pyscipopt.quicksum(float(value) * z[k] for k, value in entries)
             if low == high:
                 model.addCons(terms == low)
                 continue
@@ -319,9 +316,7 @@ def scip(tolerance: float, seconds: float) -> Solve:
             model.addCons(z[i] * z[i] <= t)
             total += float(squares[i]) * t
         model.setObjective(total, "minimize")
-        begin = time.perf_counter()
-        model.optimize()
-        elapsed = time.perf_counter() - begin
+        elapsed, _ = taken(model.optimize)
         status, bound = model.getStatus(), model.getDualbound()
         if status == "infeasible":
             return PeerAnswer("infeasible", seconds=elapsed)
@@ -332,6 +327,10 @@ def scip(tolerance: float, seconds: float) -> Solve:
         return PeerAnswer("optimal" if done else "limit", point, bound, elapsed)
 
     return solve
+
+
+def _finite(limit: float) -> float | None:
+    return limit if math.isfinite(limit) else None
 
 
 def gurobi(tolerance: float, seconds: float) -> Solve:
@@ -354,9 +353,7 @@ def gurobi(tolerance: float, seconds: float) -> Solve:
             model.setObjective(0.5 * (z @ form.P @ z) + form.c @ z)
             model.Params.TimeLimit, model.Params.MIPGap = seconds, tolerance
             model.Params.FeasibilityTol = model.Params.IntFeasTol = 1e-9
-            begin = time.perf_counter()
-            model.optimize()
-            elapsed = time.perf_counter() - begin
+            elapsed, _ = taken(model.optimize)
             if model.Status == gurobipy.GRB.INFEASIBLE:
                 return PeerAnswer("infeasible", seconds=elapsed)
             if not model.SolCount:
@@ -370,17 +367,15 @@ def gurobi(tolerance: float, seconds: float) -> Solve:
 _UPDATED = "update of the vectors and solve; set up once per run"
 _ANEW = "setup and solve"
 QP_PEERS = (
-    Peer("PIQP sparse", "piqp", "piqp", forms.lifted, piqp, _UPDATED, True),
-    Peer("Clarabel", "clarabel", "clarabel", forms.lifted, clarabel, _UPDATED, True, limit=60),
-    Peer(
-        "OSQP 1e-6", "osqp", "osqp", lambda case: forms.dense(case).scaled(), osqp, _UPDATED, True, limit=20
-    ),
-    Peer("DAQP", "daqp", "daqp", forms.dense, daqp, _ANEW, limit=12),
-    Peer("HiGHS QP", "highspy", "highspy", forms.lifted, highs, _ANEW, limit=8, hopeless=2.0),
-    Peer("qpax", "qpax", "qpax", forms.dense, qpax, "solve, compiled before", limit=2),
+    Peer("PIQP sparse", "piqp", forms.lifted, piqp, _UPDATED, True),
+    Peer("Clarabel", "clarabel", forms.lifted, clarabel, _UPDATED, True, limit=60),
+    Peer("OSQP 1e-6", "osqp", lambda case: forms.dense(case).scaled(), osqp, _UPDATED, True, limit=20),
+    Peer("DAQP", "daqp", forms.dense, daqp, _ANEW, limit=12),
+    Peer("HiGHS QP", "highspy", forms.lifted, highs, _ANEW, limit=8, hopeless=2.0),
+    Peer("qpax", "qpax", forms.dense, qpax, "solve, compiled before", limit=2),
 )
 MIQP_PEERS = (
-    Peer("SCIP", "pyscipopt", "pyscipopt", forms.lifted, scip, "solve", limit=5, hopeless=15.0),
-    Peer("Gurobi", "gurobipy", "gurobipy", forms.lifted, gurobi, "solve", limit=20, hopeless=20.0),
-    Peer("DAQP", "daqp", "daqp", forms.dense, daqp, _ANEW, limit=5, hopeless=10.0),
+    Peer("SCIP", "pyscipopt", forms.lifted, scip, "solve", limit=5, hopeless=15.0),
+    Peer("Gurobi", "gurobipy", forms.lifted, gurobi, "solve", limit=20, hopeless=20.0),
+    Peer("DAQP", "daqp", forms.dense, daqp, _ANEW, limit=5, hopeless=10.0),
 )

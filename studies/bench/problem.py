@@ -12,6 +12,10 @@ from types import SimpleNamespace
 
 import numpy as np
 
+WEIGHTS = dict(
+    Q="cv_weight", P="move_weight", S2="soft_quadratic", S1="soft_linear", c="deadzone", rho="slack_weight"
+)
+LIMITS = dict(ylo="cv_low", yhi="cv_high", ulo="mv_low", uhi="mv_high", dlo="move_low", dhi="move_high")
 STEP_ROUNDING = 1e-6  # [steps]: a limit so close to a whole number of steps counts as that number
 
 
@@ -35,25 +39,10 @@ def read(case: dict) -> SimpleNamespace:
     for c, m in np.ndindex(n.cvs, n.mvs):
         response = np.asarray(model["coefficients"][c][m], dtype=float)
         n.S[c, m] = response[np.minimum(np.arange(n.hp), len(response) - 1)]
-    n.Q, n.P, n.S2, n.S1, n.c, n.rho = (
-        np.array(tuning[key], dtype=float)
-        for key in (
-            "cv_weight",
-            "move_weight",
-            "soft_quadratic",
-            "soft_linear",
-            "deadzone",
-            "slack_weight",
-        )
-    )
-    for name, key, missing in (
-        ("ylo", "cv_low", -np.inf),
-        ("yhi", "cv_high", np.inf),
-        ("ulo", "mv_low", -np.inf),
-        ("uhi", "mv_high", np.inf),
-        ("dlo", "move_low", -np.inf),
-        ("dhi", "move_high", np.inf),
-    ):
+    for name, key in WEIGHTS.items():
+        setattr(n, name, np.array(tuning[key], dtype=float))
+    for name, key in LIMITS.items():
+        missing = -np.inf if key.endswith("low") else np.inf
         setattr(n, name, np.array([missing if v is None else v for v in tuning[key]], dtype=float))
     n.u0, n.last = np.array(case["mv_now"], dtype=float), np.array(case["last_move"], dtype=float)
     n.free, n.r = np.array(case["free_response"], dtype=float), np.array(case["setpoint"], dtype=float)

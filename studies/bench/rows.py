@@ -104,30 +104,40 @@ class Row(msgspec.Struct, kw_only=True):
     note: str = ""
 
 
-def timed(name: str, section: str, seconds: Sequence[float] | np.ndarray, errors, **more: Any) -> Row:
+def timed(name: str, section: str, times: Sequence[float] | np.ndarray, errors: Any, **more: Any) -> Row:
     """A row from the time and the error of every problem.
 
     Args:
         name, section: of the row.
-        seconds: ``"problem"`` [s].
+        times: ``"problem"`` [s].
         errors: ``"problem"``; not a number for a problem without a solution.
-        **more: further fields of `Row`.
+        **more: further fields of `Row`, or others than follow from the times.
     """
-    seconds, errors = np.asarray(seconds, dtype=float), np.asarray(errors, dtype=float)
+    times, errors = np.asarray(times, dtype=float), np.asarray(errors, dtype=float)
     found = errors[~np.isnan(errors)]
     worst = float(found.max()) if len(found) else None
-    return Row(
-        name=name,
-        section=section,
-        instances=len(errors),
-        solved=int((found <= RIGHT).sum()),
-        median_ms=float(np.median(seconds)) * 1e3,
-        p99_ms=float(np.percentile(seconds, 99)) * 1e3,
-        rate=len(seconds) / float(seconds.sum()),
-        worst_error=worst,
-        counts=worst is not None and worst <= RIGHT,
-        **more,
-    )
+    fields = {
+        "instances": len(errors),
+        "solved": int((found <= RIGHT).sum()),
+        "median_ms": float(np.median(times)) * 1e3,
+        "p99_ms": float(np.percentile(times, 99)) * 1e3,
+        "rate": len(times) / float(times.sum()),
+        "worst_error": worst,
+        "counts": worst is not None and worst <= RIGHT,
+    }
+    return Row(name=name, section=section, **{**fields, **more})
+
+
+def batched(name: str, section: str, seconds: float, count: int, errors: Any, **more: Any) -> Row:
+    """A row for `count` problems that were solved in one call; arguments as for `timed`, `seconds` of the call."""
+    fields = {"median_ms": seconds / count * 1e3, "p99_ms": None, "rate": count / seconds, "seconds": seconds}
+    return timed(name, section, [seconds], errors, **{**fields, **more})
+
+
+def whole(name: str, section: str, seconds: float, errors: Any, **more: Any) -> Row:
+    """A row of which only the seconds of the whole matter; arguments as for `timed`."""
+    fields = {"median_ms": None, "p99_ms": None, "rate": None, "seconds": seconds}
+    return timed(name, section, [seconds], errors, **{**fields, **more})
 
 
 class Report(msgspec.Struct, kw_only=True):
@@ -155,15 +165,7 @@ class Report(msgspec.Struct, kw_only=True):
         for row, made in zip(self.rows, body["rows"], strict=True):
             for goal, shown in zip(row.goals, made["goals"], strict=True):
                 shown["met"] = goal.met(row)
-        return msgspec.json.format(msgspec.json.encode(_finite(body)), indent=1).decode() + "\n"
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
-    return [_finite(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+        return msgspec.json.format(msgspec.json.encode(body), indent=1).decode() + "\n"
 
 
 def table(report: Report) -> str:

@@ -42,6 +42,7 @@ CONTROLLERS = {  # kind of the controller and of the choke
     "mixed-integer": ("mixed-integer", "step"),
 }
 BLOCKING = ("moves", "inputs", "none")
+CHOICES = {"controller": tuple(CONTROLLERS), "preset": tuple(presets.TUNINGS), "blocking": BLOCKING}
 START = references.THESIS_WINDOWS[0][1:]  # gas and oil setpoint at the working point [m3/h]
 STEP_TIME = 300.0  # s, when the setpoints of a short run change
 SHORT = 1800.0  # s, length of a short run
@@ -63,6 +64,11 @@ SHOWN = {
     "largest_gap": "largest gap",
     "not_optimal": "not optimal",
 }
+
+
+def _in(unit: str, default: float | None) -> Any:
+    """A number of `Settings` with its unit."""
+    return dataclasses.field(default=default, metadata={"unit": unit})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,25 +98,23 @@ class Settings:
     preset: str = "thesis"
     soft: bool = True
     blocking: str = "moves"
-    choke_weight: float | None = None
-    gas_weight: float | None = None
-    oil_weight: float | None = None
-    gas_deadzone: float | None = None
-    oil_deadzone: float | None = None
-    model_choke: float = 50.0
-    model_lift: float = 7500.0
-    gas_setpoint: float = 9640.0
-    oil_setpoint: float = 152.0
-    pressure: float = 0.0
-    pressure_time: float = 900.0
+    choke_weight: float | None = _in("1/%^2", None)
+    gas_weight: float | None = _in("1/(m3/h)^2", None)
+    oil_weight: float | None = _in("1/(m3/h)^2", None)
+    gas_deadzone: float | None = _in("m3/h", None)
+    oil_deadzone: float | None = _in("m3/h", None)
+    model_choke: float = _in("%", 50.0)
+    model_lift: float = _in("m3/h", 7500.0)
+    gas_setpoint: float = _in("m3/h", 9640.0)
+    oil_setpoint: float = _in("m3/h", 152.0)
+    pressure: float = _in("bar", 0.0)
+    pressure_time: float = _in("s", 900.0)
     whole: bool = False
 
     def __post_init__(self):
-        for field, known in (("controller", tuple(CONTROLLERS)), ("preset", tuple(presets.TUNINGS))):
+        for field, known in CHOICES.items():
             if getattr(self, field) not in known:
                 raise InputError(field, getattr(self, field), f"one of {', '.join(known)}")
-        if self.blocking not in BLOCKING:
-            raise InputError("blocking", self.blocking, f"one of {', '.join(BLOCKING)}")
         if self.blocking == "none" and self.controller == "mixed-integer":
             raise InputError(
                 "blocking",
@@ -118,9 +122,9 @@ class Settings:
                 "blocks for whole moves",
                 "Without blocks a step with whole moves takes seconds; choose moves or inputs, or another controller",
             )
-        for field in ("pressure", "pressure_time"):
+        for field, unit in (("pressure", "bar"), ("pressure_time", "s")):
             if not np.isfinite(getattr(self, field)):
-                raise InputError(field, getattr(self, field), f"a number [{FIELD_UNITS[field]}]")
+                raise InputError(field, getattr(self, field), f"a number [{unit}]")
 
     @property
     def structure(self) -> Structure:
@@ -158,21 +162,6 @@ class Settings:
         return np.where(
             np.arange(self.reference.samples(dt)) * dt >= self.pressure_time - 1e-9 * dt, self.pressure, 0.0
         )
-
-
-FIELD_UNITS = {
-    "choke_weight": "1/%^2",
-    "gas_weight": "1/(m3/h)^2",
-    "oil_weight": "1/(m3/h)^2",
-    "gas_deadzone": "m3/h",
-    "oil_deadzone": "m3/h",
-    "model_choke": "%",
-    "model_lift": "m3/h",
-    "gas_setpoint": "m3/h",
-    "oil_setpoint": "m3/h",
-    "pressure": "bar",
-    "pressure_time": "s",
-}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -327,16 +316,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
         allow_abbrev=False,
     )
-    choices = {"controller": tuple(CONTROLLERS), "preset": tuple(presets.TUNINGS), "blocking": BLOCKING}
     for field in dataclasses.fields(Settings):
         option = f"--{field.name.replace('_', '-')}"
         if isinstance(field.default, bool):
             action = argparse.BooleanOptionalAction
             parser.add_argument(option, action=action, default=field.default, help="-")
-        elif field.name in choices:
-            parser.add_argument(option, choices=choices[field.name], default=field.default, help="-")
+        elif field.name in CHOICES:
+            parser.add_argument(option, choices=CHOICES[field.name], default=field.default, help="-")
         else:
-            unit = FIELD_UNITS[field.name].replace("%", "%%")
+            unit = field.metadata["unit"].replace("%", "%%")
             given = "" if field.default is not None else ", the preset's if not given"
             parser.add_argument(option, type=float, default=field.default, help=f"[{unit}]{given}")
     options = vars(parser.parse_args(arguments))

@@ -13,16 +13,16 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.plant import WellPlant
 from jaxmpc.process.well.host import HostWell
-from studies.definition.comparison import PLANTS, ComparisonDefinition, PlantKind, ReferenceDefinition
+from studies.definition.comparison import ComparisonDefinition, PlantKind, ReferenceDefinition
 from studies.run.comparison import is_current, run_controller
 from studies.store.comparison import check_writable, open_results
 from studies.thesis import catalogue
 from studies.thesis.claims import ROWS, Claim, Evidence, judge, tables
+from studies.thesis.comparison import study_name
 
 FORMAT = "jaxmpc/claims/1"
 NEEDED = tuple(dict.fromkeys(row.study for row in ROWS))  # keys of `studies.thesis.catalogue.STUDIES`
@@ -42,23 +42,14 @@ def run_claims(
     """Measure every row on the studies of the catalogue; what of them is stored and current is not run again.
 
     Args:
-        out: folder of all results; the tables go to ``claims-PLANT`` or ``claims-quick-PLANT`` in it.
-        quick: measure the shortened studies.
-        plant: ``fmu``, or ``jax`` for its JAX twin, which needs no C compiler.
-        progress: whether to show bars with rate and time left.
-        say: receives one line per event.
+        out, quick, plant, progress, say: as for `studies.thesis.catalogue.run_named`.
         gallery: page of the figures for the links of ``claims.html``, relative to it.
 
     Returns:
-        The folder with ``claims.md``, ``claims.csv``, ``claims.json`` and ``claims.html``.
-
-    Raises:
-        InputError: for an unknown plant or a folder that cannot be written, before anything is computed.
-        MissingToolError: if the FMU cannot be built.
+        The folder ``claims-PLANT`` or ``claims-quick-PLANT`` with ``claims.md``, ``claims.csv``, ``claims.json`` and
+        ``claims.html``; errors as for `run_named`.
     """
-    if plant not in PLANTS:
-        raise InputError("plant", plant, f"one of {', '.join(PLANTS)}")
-    folder = check_writable(Path(out) / f"claims-{'quick-' if quick else ''}{plant}")
+    folder = check_writable(Path(out) / study_name("claims", quick, plant))
     found: dict[str, Claim] = {}
     hashes: dict[str, str] = {}
     for study in NEEDED:
@@ -76,39 +67,20 @@ def run_claims(
         evidence = Evidence.of(data, clock)
         found |= {row.id: judge(row, evidence) for row in ROWS if row.study == study}
     claims = [found[row.id] for row in ROWS]
-    write_tables(claims, folder, quick, plant, hashes, gallery)
+    _write(claims, folder, quick, plant, hashes, gallery)
     say(f"{tables.tally(claims)}: {folder / 'claims.html'}")
     return folder
 
 
-def write_tables(
-    claims: list[Claim],
-    folder: Path,
-    quick: bool,
-    plant: PlantKind,
-    hashes: dict[str, str],
-    gallery: str = GALLERY,
+def _write(
+    claims: list[Claim], folder: Path, quick: bool, plant: PlantKind, hashes: dict[str, str], gallery: str
 ) -> None:
-    """Write the rows as ``claims.md``, ``claims.csv``, ``claims.json`` and ``claims.html``, each in one go.
-
-    Args:
-        claims: measured.
-        folder: for the files.
-        quick: whether the shortened studies were measured.
-        plant: of the studies.
-        hashes: which results were measured, study by study.
-        gallery: see `run_claims`.
-    """
+    """Write the rows as ``claims.md``, ``claims.csv``, ``claims.json`` and ``claims.html``, each in one go."""
     title = "The statements of the thesis, measured"
     well = "an FMU of the well" if plant == "fmu" else "the JAX twin of the well"
     note = f"Measured on our own runs: {'shortened' if quick else 'full'} studies, {well}."
-    body = {
-        "format": FORMAT,
-        "quick": quick,
-        "plant": plant,
-        "results": hashes,
-        "claims": msgspec.to_builtins(claims),
-    }
+    body = {"format": FORMAT, "quick": quick, "plant": plant, "results": hashes}
+    body["claims"] = [claim.written() for claim in claims]
     write_atomically(folder / "claims.md", tables.markdown(claims, title))
     write_atomically(folder / "claims.csv", tables.table_csv(claims))
     write_atomically(folder / "claims.json", json.dumps(body, indent=1, ensure_ascii=False))

@@ -84,16 +84,16 @@ def dot(left: Point, right: Point) -> Fraction:
     return left[0] * right[0] + left[1] * right[1]
 
 
+def solved(one: Point, other: Point, right: Point) -> Point | None:
+    """X with ``one . x = right[0]`` and ``other . x = right[1]``, by Cramer's rule; None for parallel ones."""
+    (a, b), (c, d), (p, q) = one, other, right
+    determinant = a * d - b * c
+    return None if determinant == 0 else ((p * d - b * q) / determinant, (a * q - p * c) / determinant)
+
+
 def crossing(one: Row, other: Row) -> Point | None:
     """Where the borders of two rows cross; None for parallel ones."""
-    (a, b), (c, d) = one.normal, other.normal
-    determinant = a * d - b * c
-    if determinant == 0:
-        return None
-    return (
-        (one.limit * d - b * other.limit) / determinant,
-        (a * other.limit - one.limit * c) / determinant,
-    )
+    return solved(one.normal, other.normal, (one.limit, other.limit))
 
 
 def corners(program: IntegerProgram) -> list[Point]:
@@ -170,10 +170,8 @@ def facets(polygon: list[Point]) -> list[Row]:
     rows = []
     for (x1, y1), (x2, y2) in zip(polygon, polygon[1:] + polygon[:1], strict=True):
         normal = (y2 - y1, x1 - x2)
-        scale = Fraction(
-            math.lcm(*(value.denominator for value in normal)),
-            math.gcd(*(int(v * math.lcm(*(w.denominator for w in normal))) for v in normal)),
-        )
+        whole = math.lcm(*(value.denominator for value in normal))
+        scale = Fraction(whole, math.gcd(*(int(value * whole) for value in normal)))
         normal = (normal[0] * scale, normal[1] * scale)
         rows.append(Row(normal, dot(normal, (x1, y1))))
     return rows
@@ -198,11 +196,10 @@ def best_cut(program: IntegerProgram) -> Cut:
     row = min(cutting, key=lambda one: program.value(after(one)))
     active = tuple(known for known in program.rows if known.excess(x) == 0)
     for pair in itertools.combinations(active, 2):
-        # multipliers u with u . normals = the cut's normal, by Cramer's rule
-        ((a, b), (c, d)), (p, q) = (known.normal for known in pair), row.normal
-        determinant = a * d - b * c
-        u = ((p * d - q * c) / determinant, (a * q - b * p) / determinant)
-        right = sum(weight * known.limit for weight, known in zip(u, pair, strict=True))
-        if min(u) >= 0 and math.floor(right) == row.limit:
+        # multipliers u with u . normals = the cut's normal
+        first, second = zip(*(known.normal for known in pair), strict=True)
+        u = solved(first, second, row.normal)
+        right = None if u is None else dot(u, (pair[0].limit, pair[1].limit))
+        if u is not None and right is not None and min(u) >= 0 and math.floor(right) == row.limit:
             return Cut(row, after(row), pair, u)
     raise InputError("program", str(row), "a facet that follows from the active rows by one rounding")

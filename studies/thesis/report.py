@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +12,10 @@ from jaxmpc.model.step_response import StepResponseModel
 from studies.definition.presets import GAS, OIL
 from studies.kpi.evaluate import key_figures
 from studies.store.comparison import open_results
+from studies.thesis.catalogue import STUDIES
 from studies.thesis.claims import claims
-from studies.thesis.extensions import LimitedSteps, limited_steps, time_limit
+from studies.thesis.tables import csv_text, markdown_table
+from studies.thesis.time_limits import LimitedSteps, limited_steps
 
 
 def write_summary(folder: str | Path, study: str) -> list[Path]:
@@ -34,7 +34,7 @@ def write_summary(folder: str | Path, study: str) -> list[Path]:
     text = markdown(data, statements=study == "thesis")
     if study == "time-limit":
         model = StepResponseModel.load(folder / "model.json")
-        text += "\n" + limits_markdown(limited_steps(data, time_limit().controllers, model))
+        text += "\n" + limits_markdown(limited_steps(data, STUDIES[study](False, "jax").controllers, model))
     return [
         write_atomically(folder / "summary.md", text),
         write_atomically(folder / "summary.csv", table_csv(data)),
@@ -94,44 +94,43 @@ def markdown(data: xr.Dataset, statements: bool = True) -> str:
         statements: whether the runs are those of the thesis study, which its statements are about.
     """
     figures = key_figures(data)
-    labels = [str(v) for v in figures.label.values]
+    head = ["", *(str(label) for label in figures.label.values)]
     lines = [f"# {data.attrs.get('title', 'Summary')}", ""]
-    lines += ["| | " + " | ".join(labels) + " |", "|---|" + "---|" * len(labels)]
-    lines += [f"| {what} | " + " | ".join(values) + " |" for what, values in summary_table(figures)]
+    lines += markdown_table(head, ([what, *values] for what, values in summary_table(figures)))
     if statements:
-        lines += ["", "| the thesis says | what we see | verdict | holds if |", "|---|---|---|---|"]
-        lines += [f"| {c.statement} | {c.value} | {c.verdict} | {c.rule} |" for c in claims(data, figures)]
+        rows = ((one.statement, one.value, one.verdict, one.rule) for one in claims(data, figures))
+        lines += ["", *markdown_table(("the thesis says", "what we see", "verdict", "holds if"), rows)]
     return "\n".join([*lines, ""])
 
 
-def limits_markdown(rows: list[LimitedSteps]) -> str:
+def limits_markdown(steps: list[LimitedSteps]) -> str:
     """What limited solve times cost as a Markdown table, one row per controller; percent of the exact optimum."""
-    lines = [
-        "| | steps that reach their limit | proven gap, median | objective lost: median / 90 % / most |",
-        "|---|---|---|---|",
-    ]
-    for row in rows:
+    head = (
+        "",
+        "steps that reach their limit",
+        "proven gap, median",
+        "objective lost: median / 90 % / most",
+    )
+    rows = []
+    for one in steps:
         # the optimum itself is known to a relative gap of 1e-6
-        lost = " / ".join("0" if value <= 1e-6 else f"{100 * value:.2g}" for value in row.lost)
-        known = f"{100 * row.gap:.2g} % | {lost} %" if row.share > 0 else " | "
-        lines.append(f"| {row.label} | {100 * row.share:.1f} % | {known} |")
-    return "\n".join([*lines, ""])
+        lost = " / ".join("0" if value <= 1e-6 else f"{100 * value:.2g}" for value in one.lost)
+        known = (f"{100 * one.gap:.2g} %", f"{lost} %") if one.share > 0 else ("", "")
+        rows.append((one.label, f"{100 * one.share:.1f} %", *known))
+    return "\n".join([*markdown_table(head, rows), ""])
 
 
 def table_csv(data: xr.Dataset) -> str:
     """Key figures as CSV, one row per controller, key figure and channel (CV, MV or window start)."""
     figures = key_figures(data)
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(["controller", "key_figure", "of", "value", "unit"])
+    rows = []
     for name in figures.controller.values:
         for key, variable in figures.data_vars.items():
             row = variable.sel(controller=name)
-            dims = list(row.dims)
-            labels = row[dims[0]].values if dims else [""]
+            labels = row[row.dims[0]].values if row.dims else [""]
             for label, value in zip(labels, np.atleast_1d(row.values), strict=True):
                 unit = row.attrs["units"]
                 if "cv_unit" in unit:
                     unit = unit.replace("cv_unit", str(figures.cv_unit.sel(cv=label).item()))
-                writer.writerow([name, key, label, repr(value.item()), unit])
-    return buffer.getvalue()
+                rows.append([name, key, label, repr(value.item()), unit])
+    return csv_text(["controller", "key_figure", "of", "value", "unit"], rows)

@@ -21,19 +21,22 @@ from identify.steady_map import steady_map
 from identify.step_test import identify_step_response
 from jaxmpc.controller.mixed_integer import MixedIntegerController
 from jaxmpc.controller.targets import TargetController, simulate_with_targets
-from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
 from jaxmpc.loop.reference import Reference
-from jaxmpc.loop.simulate import simulate
+from jaxmpc.loop.simulate import Progress, simulate
+from jaxmpc.loop.trajectory import Trajectory
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.problem.structure import Structure
 from jaxmpc.steady.map import SteadyMap
 from jaxmpc.steady.optimise import LIFT_RANGES, Targets, optimise
 from studies.definition import presets
-from studies.definition.comparison import PLANTS, PlantKind
+from studies.definition.comparison import PlantKind
 from studies.definition.presets import CHOKE, GAS, LIFT, OIL
 from studies.run.comparison import closing, progress_bar
 from studies.store.comparison import ResultStore, check_writable, locked, open_results, results_template
 from studies.store.fingerprint import content_hash, module_hash, source_hash, versions
-from studies.thesis.comparison import plant_factory
+from studies.thesis.comparison import over_inputs, plant_factory, study_name
+from studies.thesis.tables import markdown_table
 
 WITHOUT, WITH = "without-rto", "with-rto"
 LABELS = {WITHOUT: "mixed-integer MPC", WITH: "mixed-integer MPC below an RTO"}
@@ -46,6 +49,11 @@ WINDOWS = (
 )
 DURATION, QUICK_DURATION = 28_800.0, 12_000.0  # s; the quick run ends before the third window
 PRICES = {GAS: 0.1, OIL: 400.0, LIFT: 0.3}  # per m3
+OPTIMISING = (
+    "jaxmpc.steady.optimise",
+    "jaxmpc.steady.milp",
+    "jaxmpc.steady.map",
+)  # modules that set the targets
 SETTLED = 300.0  # s at the end of a window that stand for where a run settles
 TARGET_WEIGHT = {CHOKE: 1.0, LIFT: 1e-3}  # 1/(%)^2, 1/(m3/h)^2
 
@@ -82,29 +90,20 @@ def run_rto(
     """Compute and store both runs; what is stored already with equal inputs is kept.
 
     Args:
-        out: folder of all results; this study gets its own folder in it.
         quick: 1,200 instead of 2,880 samples.
         plant: ``jax``, or ``fmu``, whose steady map takes longer.
-        progress: whether to show bars with rate and time left.
-        say: receives one line per event.
+        out, progress, say: as for `studies.thesis.catalogue.run_named`.
 
     Returns:
         The folder of the study, with ``results.zarr`` (see `studies.store.comparison.open_results`), ``model.json``,
-        ``steady_map.json`` and ``summary.md``, where both runs settle.
-
-    Raises:
-        InputError: for an unknown plant or a folder that cannot be written, before anything is computed.
-        MissingToolError: if the FMU cannot be built.
+        ``steady_map.json`` and ``summary.md``, where both runs settle; errors as for `run_named`.
     """
-    if plant not in PLANTS:
-        raise InputError("plant", plant, f"one of {', '.join(PLANTS)}")
-    folder = check_writable(Path(out) / f"rto-{'quick-' if quick else ''}{plant}")
+    folder = check_writable(Path(out) / study_name("rto", quick, plant))
     demanded = demands(quick)
     with locked(folder):
         make_plant, facts = plant_factory(plant, say)
         with closing(make_plant("continuous")) as tested:
-            model = identify_step_response(tested)
-            steady = steady_map(tested)
+            model, steady = identify_step_response(tested), steady_map(tested)
         model.save(folder / "model.json")
         steady.save(folder / "steady_map.json")
         structure = presets.structure(integer=True)
@@ -115,72 +114,123 @@ def run_rto(
                 f"Demand {rates[0]:.0f} / {rates[1]:.0f} m3/h: gas {each.cv[0]:.0f}, oil {each.cv[1]:.0f} m3/h "
                 f"with {each.mv[0]:.0f} % choke and {each.mv[1]:.0f} m3/h lift. {each.message}"
             )
-        code = {package: source_hash(package) for package in ("jaxmpc", "identify")}
-        code |= {
-            name: module_hash(name)
-            for name in ("jaxmpc.steady.optimise", "jaxmpc.steady.milp", "jaxmpc.steady.map")
-        }
-        inputs = {
-            "plant": facts,
-            "model": np.asarray(model.coefficients),
-            "map": steady.cv,
-            "demands": [demanded.times.tolist(), demanded.setpoints.tolist(), demanded.duration],
-            "prices": PRICES,
-            "tuning": presets.tuning_fields(),
-            "code": code,
-        }
-        hashes = [content_hash(inputs, WITHOUT), content_hash(inputs, WITH, TARGET_WEIGHT)]
-        study_hash = content_hash(folder.name, hashes)
-        provenance = {
-            "study": folder.name,
-            "title": "Low demands: mixed-integer MPC with and without real-time optimisation",
-            "dt": structure.dt,
-            "plant": facts,
-            "prices": PRICES,
-            "target_weight": TARGET_WEIGHT,
-            "lift_ranges": [list(pair) for pair in LIFT_RANGES],
-            "messages": [each.message for each in found],
-            "code": code,
-            "versions": versions(),
-            "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        }
+        shared = _shared(demanded, found, np.asarray(tuning.deadzone), steady, structure.dt)
+        store = _store(folder, demanded, found, facts, model, structure, shared, say)
 
-        def template() -> xr.Dataset:
-            return results_template(
-                controllers=list(LABELS),
-                labels=list(LABELS.values()),
-                hashes=hashes,
-                time=structure.dt * np.arange(demanded.samples(structure.dt)),
-                cv_names=structure.cv_names,
-                mv_names=structure.mv_names,
-                cv_units=structure.cv_units,
-                mv_units=structure.mv_units,
-                blocks=structure.block_count,
-                shared=_shared(demanded, found, tuning, steady, structure.dt),
-                provenance=provenance,
-                study_hash=study_hash,
+        def close(name: str, well: Any, report: Progress | None) -> Trajectory:
+            if name == WITHOUT:
+                return simulate(
+                    MixedIntegerController(structure, tuning, model), well, demanded, progress=report
+                )
+            setpoints, ideal = (
+                Reference(demanded.times, [getattr(each, key) for each in found], demanded.duration)
+                for key in ("cv", "mv")
             )
+            controller = TargetController(structure, tuning, model, TARGET_WEIGHT)
+            return simulate_with_targets(controller, well, setpoints, ideal, progress=report)
 
-        store = ResultStore.begin(folder, list(LABELS), study_hash, template, say)
-        over = lambda rows: Reference(demanded.times, rows, demanded.duration)  # noqa: E731
         for name, label in LABELS.items():
             if store.complete(name):
                 say(f"{label}: stored already.")
                 continue
             started = time.perf_counter()
             with closing(make_plant("step")) as well, progress_bar(label, progress) as report:
-                if name == WITHOUT:
-                    controller = MixedIntegerController(structure, tuning, model)
-                    run = simulate(controller, well, demanded, progress=report)
-                else:
-                    controller = TargetController(structure, tuning, model, TARGET_WEIGHT)
-                    setpoints, ideal = over([t.cv for t in found]), over([t.mv for t in found])
-                    run = simulate_with_targets(controller, well, setpoints, ideal, progress=report)
+                run = close(name, well, report)
             wall_time = time.perf_counter() - started
             store.write(name, run, wall_time)
             say(f"{label}: {run.samples} samples in {wall_time:.1f} s.")
     write_atomically(folder / "summary.md", markdown(open_results(folder).load()))
     return folder
+
+
+def _store(
+    folder: Path,
+    demanded: Reference,
+    found: list[Targets],
+    facts: dict[str, Any],
+    model: StepResponseModel,
+    structure: Structure,
+    shared: dict[str, xr.DataArray],
+    say: Callable[[str], None],
+) -> ResultStore:
+    """The store of both runs, which keeps what was computed with equal inputs."""
+    code = {package: source_hash(package) for package in ("jaxmpc", "identify")}
+    code |= {name: module_hash(name) for name in OPTIMISING}
+    inputs = {
+        "plant": facts,
+        "model": np.asarray(model.coefficients),
+        "map": shared["map_rate"].values,
+        "demands": [demanded.times.tolist(), demanded.setpoints.tolist(), demanded.duration],
+        "prices": PRICES,
+        "tuning": presets.tuning_fields(),
+        "code": code,
+    }
+    hashes = [content_hash(inputs, WITHOUT), content_hash(inputs, WITH, TARGET_WEIGHT)]
+    study_hash = content_hash(folder.name, hashes)
+    provenance = {
+        "study": folder.name,
+        "title": "Low demands: mixed-integer MPC with and without real-time optimisation",
+        "dt": structure.dt,
+        "plant": facts,
+        "prices": PRICES,
+        "target_weight": TARGET_WEIGHT,
+        "lift_ranges": [list(pair) for pair in LIFT_RANGES],
+        "messages": [each.message for each in found],
+        "code": code,
+        "versions": versions(),
+        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
+
+    def template() -> xr.Dataset:
+        return results_template(
+            controllers=list(LABELS),
+            labels=list(LABELS.values()),
+            hashes=hashes,
+            time=structure.dt * np.arange(demanded.samples(structure.dt)),
+            cv_names=structure.cv_names,
+            mv_names=structure.mv_names,
+            cv_units=structure.cv_units,
+            mv_units=structure.mv_units,
+            blocks=structure.block_count,
+            shared=shared,
+            provenance=provenance,
+            study_hash=study_hash,
+        )
+
+    return ResultStore.begin(folder, list(LABELS), study_hash, template, say)
+
+
+def _shared(
+    demanded: Reference, found: list[Targets], deadzone: np.ndarray, steady: SteadyMap, dt: float
+) -> dict[str, xr.DataArray]:
+    """Demands, setpoints, targets, tuning and the steady map, as variables of the results."""
+    window, rates = demanded.window(dt), demanded.sample(dt)
+    cv, mv = (np.array([getattr(each, key) for each in found])[window] for key in ("cv", "mv"))
+    setpoint, target = np.stack([rates, cv]), np.stack([np.full_like(mv, np.nan), mv])
+    profit = np.array([each.profit for each in found])
+    lanes = ("controller", "time")
+    variables: dict[str, tuple[np.ndarray, tuple[str, ...], str, str]] = {
+        "demanded": (rates, ("time", "cv"), "demanded CV", "cv_unit"),
+        "setpoint": (setpoint, (*lanes, "cv"), "setpoint", "cv_unit"),
+        "target": (target, (*lanes, "mv"), "input target", "mv_unit"),
+        "window": (window.astype("i4"), ("time",), "index of the demand", "1"),
+        "profit": (profit, ("demand",), "steady profit of the target", "1/h"),
+        "tuning_deadzone": (
+            np.tile(deadzone, (2, 1)),
+            ("controller", "cv"),
+            "half width of the deadzone",
+            "cv_unit",
+        ),
+    }
+    out = {
+        name: xr.DataArray(values, dims=dims, attrs={"long_name": long_name, "units": unit})
+        for name, (values, dims, long_name, unit) in variables.items()
+    }
+    for name, value in {"kind": "mixed-integer", "actuator": "step"}.items():
+        out[name] = xr.DataArray(np.array([value] * 2, dtype=np.dtypes.StringDType()), dims="controller")
+    return out | {
+        "map_rate": over_inputs("map", steady.choke, steady.lift, steady.cv, "steady CV", "cv_unit")
+    }
 
 
 def markdown(data: xr.Dataset) -> str:
@@ -189,12 +239,15 @@ def markdown(data: xr.Dataset) -> str:
     Args:
         data: results of `run_rto`, both runs finished.
     """
-    lines = [
-        f"# {data.attrs['title']}",
-        "",
-        "| gas / oil demanded [m3/h] | run | choke [%] | lift [m3/h] | gas / oil off the demand [m3/h] | half widths off |",
-        "|---|---|---|---|---|---|",
-    ]
+    head = (
+        "gas / oil demanded [m3/h]",
+        "run",
+        "choke [%]",
+        "lift [m3/h]",
+        "gas / oil off the demand [m3/h]",
+        "half widths off",
+    )
+    rows = []
     window, half = data.window.values, data.tuning_deadzone.isel(controller=0)
     samples = round(SETTLED / float(data.attrs["dt"]))
     for w in range(int(window.max()) + 1):
@@ -205,51 +258,15 @@ def markdown(data: xr.Dataset) -> str:
             off = (run.measurement - rates).mean("time")
             choke, lift = (float(run.position.sel(mv=mv).mean()) for mv in (CHOKE, LIFT))
             far = float((np.abs(off) / half).max())
-            lines.append(
-                f"| {float(rates.sel(cv=GAS)):.0f} / {float(rates.sel(cv=OIL)):.0f} | {run.label.item()} | {choke:.1f} | "
-                f"{lift:.0f} | {float(off.sel(cv=GAS)):+.0f} / {float(off.sel(cv=OIL)):+.1f} | {far:.2f} |"
+            asked, away = ([float(v.sel(cv=cv)) for cv in (GAS, OIL)] for v in (rates, off))
+            rows.append(
+                (
+                    f"{asked[0]:.0f} / {asked[1]:.0f}",
+                    str(run.label.item()),
+                    f"{choke:.1f}",
+                    f"{lift:.0f}",
+                    f"{away[0]:+.0f} / {away[1]:+.1f}",
+                    f"{far:.2f}",
+                )
             )
-    return "\n".join([*lines, ""])
-
-
-def _shared(
-    demanded: Reference, found: list[Targets], tuning, steady: SteadyMap, dt: float
-) -> dict[str, xr.DataArray]:
-    """Demands, setpoints, targets, tuning and the steady map, as variables of the results."""
-    window = demanded.window(dt)
-    rates = demanded.sample(dt)
-    cv, mv = (np.array([getattr(t, key) for t in found])[window] for key in ("cv", "mv"))
-    text = np.dtypes.StringDType()
-    of_each = lambda value: xr.DataArray(np.array([value] * 2, dtype=text), dims="controller")  # noqa: E731
-    variables: dict[str, tuple[Any, tuple[str, ...], str, str]] = {
-        "demanded": (rates, ("time", "cv"), "demanded CV", "cv_unit"),
-        "setpoint": (np.stack([rates, cv]), ("controller", "time", "cv"), "setpoint", "cv_unit"),
-        "target": (
-            np.stack([np.full_like(mv, np.nan), mv]),
-            ("controller", "time", "mv"),
-            "input target",
-            "mv_unit",
-        ),
-        "window": (window.astype("i4"), ("time",), "index of the demand", "1"),
-        "profit": (np.array([t.profit for t in found]), ("demand",), "steady profit of the target", "1/h"),
-        "tuning_deadzone": (
-            np.tile(tuning.deadzone, (2, 1)),
-            ("controller", "cv"),
-            "half width of the deadzone",
-            "cv_unit",
-        ),
-    }
-    out = {
-        name: xr.DataArray(values, dims=dims, attrs={"long_name": long_name, "units": unit})
-        for name, (values, dims, long_name, unit) in variables.items()
-    }
-    out["map_rate"] = xr.DataArray(
-        steady.cv,
-        dims=("cv", "map_lift", "map_choke"),
-        coords={
-            "map_choke": ("map_choke", steady.choke, {"long_name": "choke", "units": "%"}),
-            "map_lift": ("map_lift", steady.lift, {"long_name": "gas lift", "units": "m3/h"}),
-        },
-        attrs={"long_name": "steady CV", "units": "cv_unit"},
-    )
-    return out | {"kind": of_each("mixed-integer"), "actuator": of_each("step")}
+    return "\n".join([f"# {data.attrs['title']}", "", *markdown_table(head, rows), ""])

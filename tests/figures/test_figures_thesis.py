@@ -307,13 +307,14 @@ def test_the_three_moves_of_an_oscillation_turn_the_choke_back_in_one_window(dra
 
 def test_events_are_marked_when_they_happen(drawn):
     data = results_of(drawn, "fine-regulation")
-    assert events.retuned_at(data, "mixed-integer") == catalogue.GAS_OFF_AT
+    retuned = catalogue.STUDIES["fine-regulation"](True, "jax").controllers[0].then[0].at
+    assert events.retuned_at(data, "mixed-integer") == retuned == 3000.0
     pressed = results_of(drawn, "disturbance")
-    assert events.disturbed_at(pressed) == catalogue.PRESSURE_DROP[0]
+    assert events.disturbed_at(pressed) == catalogue.STUDIES["disturbance"](True, "jax").disturbance[0][0]
     with registry.FIGURES["29"].draw(data) as picture:
         for axes in picture.axes:
             (line,) = [line for line in axes.lines if line.get_linestyle() == ":"]
-            assert line.get_xdata()[0] == pytest.approx(catalogue.GAS_OFF_AT / 60)
+            assert line.get_xdata()[0] == pytest.approx(retuned / 60)
     with pytest.raises(InputError, match="0 bar throughout"):
         events.disturbed_at(data)
     with pytest.raises(InputError, match="tuning changes"):

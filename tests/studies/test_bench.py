@@ -212,7 +212,7 @@ def test_a_damaged_recording_is_made_again_and_named(model, reference, cache, ca
 
 def test_a_wrong_peer_is_flagged_and_a_missing_one_is_named(cache, tmp_path):
     path = tmp_path / "new" / "bench.json"
-    absent = peer("Nowhere", package="no-such-solver", module="no_such_solver")
+    absent = peer("Nowhere", package="no-such-solver")
     report = measure("relaxed", (PIQP, peer("Liar", begin=wrong), absent), json_path=path)
     assert report.complete
     found = {row.name.partition(": ")[2]: row for row in report.rows}

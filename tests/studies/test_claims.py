@@ -103,7 +103,7 @@ def thesis():
 
 
 def soft():
-    data = resting(catalogue.soft(True, "jax"))
+    data = resting(catalogue.STUDIES["soft"](True, "jax"))
     samples = data.sizes["time"]
     for name in ("nominal", "soft"):
         moved(data, name, 8.0 + (swinging(samples, 200, 560) if name == "nominal" else 0.0))
@@ -112,7 +112,7 @@ def soft():
 
 def without_soft(factor=3.0):
     """The choke swings by 2 %, for which 200 and 4 m3/h are predicted; the well does so many times that."""
-    data = resting(catalogue.without_soft(True, "jax"))
+    data = resting(catalogue.STUDIES["without-soft"](True, "jax"))
     samples = data.sizes["time"]
     swing = swinging(samples, 10, 155)
     for name in ("soft", "no-soft", "no-soft-plain"):
@@ -127,7 +127,7 @@ def without_soft(factor=3.0):
 
 def predictions():
     """The plan expects oil to arrive and gas to end 987 m3/h short; feedback goes further and reaches both."""
-    data = resting(catalogue.predictions(True, "jax"))
+    data = resting(catalogue.STUDIES["predictions"](True, "jax"))
     k = np.arange(data.sizes["time"])
     data.plan.values[:, 60, 0] = (10.0, 100.0)
     moved(data, "closed-loop", np.where(k < 60, 50.0, 62.0), np.where(k < 60, 7500.0, 8000.0))
@@ -138,21 +138,21 @@ def predictions():
 
 
 def fine_regulation():
-    data = resting(catalogue.fine_regulation(True, "jax"))
+    data = resting(catalogue.STUDIES["fine-regulation"](True, "jax"))
     k = np.arange(data.sizes["time"])
     data.measurement.values[0, :300] += (500.0, -5.0)
     return moved(data, "mixed-integer", 50.0, 7500.0 + np.clip(k - 299, 0, 100) * 5.0)
 
 
 def disturbance():
-    data = resting(catalogue.disturbance(True, "jax"))
+    data = resting(catalogue.STUDIES["disturbance"](True, "jax"))
     k = np.arange(data.sizes["time"])
     data.measurement.values[0, 100:150, OIL] -= 9.0
     return moved(data, "mixed-integer", 50.0, 7500.0 + np.clip(k - 99, 0, 100) * 2.0)
 
 
 def unblocked():
-    data = resting(catalogue.unblocked(False, "jax"))
+    data = resting(catalogue.STUDIES["unblocked"](False, "jax"))
     for name in ("no-blocks", "mixed-integer-no-blocks"):
         data.solve_time.values[at(data, name)] = 0.01
     return data
@@ -543,7 +543,7 @@ def test_a_run_is_timed_on_the_host_over_its_first_part(monkeypatch):
     from jaxmpc.process.plant import WellPlant
 
     monkeypatch.setattr(claims_study, "TIMED", 60.0)
-    study = catalogue.unblocked(True, "jax")
+    study = catalogue.STUDIES["unblocked"](True, "jax")
     times = claims_study.step_times(study, "blocks", identify_step_response(WellPlant()))
     assert times.shape == (6,)
     assert (times > 0).all()

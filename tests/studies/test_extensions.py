@@ -20,7 +20,7 @@ from studies.definition import presets
 from studies.definition.comparison import ComparisonDefinition, ControllerDefinition, ReferenceDefinition
 from studies.run import comparison
 from studies.store.comparison import open_results
-from studies.thesis import catalogue, extensions, report
+from studies.thesis import catalogue, report, time_limits
 
 AT = np.array([11000.0, 185.0]), np.array([50.0, 7500.0])  # CVs, MVs
 KINDS = pytest.mark.parametrize("integer", [False, True], ids=["continuous", "mixed-integer"])
@@ -28,19 +28,14 @@ STEP = eqx.filter_jit(lambda controller, *arguments: controller.step(*arguments)
 
 
 @pytest.mark.parametrize("quick", [False, True])
-@pytest.mark.parametrize("name", extensions.STUDIES)
+@pytest.mark.parametrize("name", ["gain-scheduling", "mean-move", "time-limit"])
 def test_every_study_has_controllers_that_can_be_built(name, quick):
-    definition = extensions.STUDIES[name](quick, "jax")
+    definition = catalogue.STUDIES[name](quick, "jax")
     definition.check()
     assert definition.name == f"{name}-{'quick-' if quick else ''}jax"
     for entry in ENTRIES:
         if entry.study == name:
             assert set(entry.needs) <= {controller.name for controller in definition.controllers}
-
-
-def test_the_names_of_the_studies_are_free_in_the_catalogue():
-    for name, made in extensions.STUDIES.items():
-        assert catalogue.STUDIES.get(name, made) is made
 
 
 def test_a_schedule_changes_what_a_controller_runs_with_and_its_absence_does_not():
@@ -166,14 +161,14 @@ def test_a_step_that_is_out_of_time_applies_the_best_plan_it_has(results):
 def test_the_replayed_state_of_an_exact_run_gives_its_objectives_again(results, model):
     definition, data = results
     asked = data.assign(status=data.status * 0 + status.LIMIT)  # solve every step again
-    loss = extensions.objective_loss(asked, definition.controllers[0], model)
+    loss = time_limits.objective_loss(asked, definition.controllers[0], model)
     assert loss == pytest.approx(np.zeros(len(loss)), abs=3e-6)
 
 
 def test_a_limited_step_loses_no_less_than_nothing_and_no_more_than_its_gap(results, model):
     definition, data = results
     run = data.sel(controller="hurried")
-    loss = extensions.objective_loss(data, definition.controllers[1], model)
+    loss = time_limits.objective_loss(data, definition.controllers[1], model)
     limited = run.status.values == status.LIMIT
     gap = run.gap.values[limited]
     assert (loss[~limited] == 0).all()
@@ -183,14 +178,14 @@ def test_a_limited_step_loses_no_less_than_nothing_and_no_more_than_its_gap(resu
 
 def test_the_table_of_limits_has_one_row_per_limited_controller(results, model):
     definition, data = results
-    (row,) = extensions.limited_steps(data, definition.controllers, model)
+    (row,) = time_limits.limited_steps(data, definition.controllers, model)
     limited = data.sel(controller="hurried").status.values == status.LIMIT
-    loss = extensions.objective_loss(data, definition.controllers[1], model)[limited]
+    loss = time_limits.objective_loss(data, definition.controllers[1], model)[limited]
     assert (row.label, row.share) == ("hurried", pytest.approx(limited.mean()))
     assert row.lost[0] == pytest.approx(np.median(loss))
     assert row.lost[0] <= row.lost[1] <= row.lost[2] == pytest.approx(loss.max())
     solved = data.assign(status=data.status * 0)
-    (none,) = extensions.limited_steps(solved, definition.controllers, model)
+    (none,) = time_limits.limited_steps(solved, definition.controllers, model)
     text = report.limits_markdown([row, none]).splitlines()
     assert text[2].startswith(f"| hurried | {100 * row.share:.1f} % | ")
     assert text[3] == "| hurried | 0.0 % |  |  |"
@@ -205,7 +200,7 @@ def test_a_controller_with_a_schedule_runs_differently_and_is_stored_under_anoth
 
 
 def test_a_scheduled_controller_without_a_schedule_is_refused(model):
-    definition = extensions.gain_scheduling(True, "jax")
+    definition = catalogue.STUDIES["gain-scheduling"](True, "jax")
     with pytest.raises(InputError, match="gain schedule"):
         comparison.run_controller(
             definition.controllers[1], definition, model, lambda actuator: WellPlant(actuator=actuator), False
@@ -239,7 +234,7 @@ def test_a_grid_that_cannot_be_identified_is_refused(field, arguments):
 
 
 def test_the_presets_reach_the_predictive_mode_through_a_definition():
-    definition = extensions.mean_move(True, "jax")
+    definition = catalogue.STUDIES["mean-move"](True, "jax")
     modes = {c.name: c.structure().mean_move_mode for c in definition.controllers}
     assert modes["continuous-predictive"] == modes["mixed-integer-predictive"] == "predictive"
     assert modes["continuous-reactive"] == presets.structure().mean_move_mode == "reactive"

@@ -395,10 +395,11 @@ def test_a_named_study_runs_from_nothing_and_a_second_call_computes_nothing(tmp_
     data = open_results(go()).load()
     assert data.complete.values.tolist() == [1, 1]
     closed, blind = (data.sel(controller=name) for name in ("closed-loop", "open-loop"))
-    at = int(catalogue.STEP_AT / 10)
+    step = catalogue.STUDIES["predictions"](True, "jax").reference.times[1]
+    at = int(step / 10)
     # one loop runs in strides and the other sample by sample: two programs, whose sums differ in the last bits
     np.testing.assert_allclose(closed.demand[: at + 1], blind.demand[: at + 1], rtol=1e-12)
-    plan = plans.plan_at(data, "closed-loop", catalogue.STEP_AT)
+    plan = plans.plan_at(data, "closed-loop", step)
     np.testing.assert_allclose(blind.demand.values[at : at + 200], plan.mv, atol=1e-6)
     away = [float(abs(one.measurement - data.setpoint).sel(cv="gas_rate")[-1]) for one in (closed, blind)]
     assert away[0] < 0.2 * away[1]

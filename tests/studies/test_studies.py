@@ -15,8 +15,7 @@ from studies.kpi import evaluate
 from studies.run import comparison
 from studies.store import fingerprint
 from studies.store.comparison import ResultStore, open_results
-from studies.thesis import claims, report
-from studies.thesis import comparison as thesis
+from studies.thesis import catalogue, claims, report
 from tests import studies_synthetic as made
 
 
@@ -148,7 +147,7 @@ def test_setpoints_shorter_than_the_run_are_refused():
 
 
 def test_the_thesis_definition_is_checked_and_survives_json():
-    definition = thesis.thesis_definition(quick=True, plant="jax")
+    definition = catalogue.STUDIES["thesis"](True, "jax")
     definition.check()
     assert msgspec.json.decode(msgspec.json.encode(definition), type=type(definition)) == definition
     assert [c.structure().integer_mvs for c in definition.controllers] == [(), (), (0,)]
@@ -158,7 +157,7 @@ def test_the_thesis_definition_is_checked_and_survives_json():
 
 def test_a_definition_names_what_is_wrong():
     with pytest.raises(InputError, match="distinct names"):
-        made.definition(controllers=thesis.CONTROLLERS[:1] * 2).check()
+        made.definition(controllers=made.CONTROLLERS[:1] * 2).check()
     with pytest.raises(InputError, match="plant"):
         made.definition(plant="fmy").check()
     with pytest.raises(InputError, match="one per CV"):
@@ -234,10 +233,8 @@ def test_a_second_run_computes_nothing(tmp_path, stubbed):
 def test_a_changed_tuning_recomputes_that_controller_only(tmp_path, stubbed):
     run_made_up(tmp_path)
     stubbed.clear()
-    changed = msgspec.structs.replace(thesis.CONTROLLERS[1], tuning="thesis-light")
-    run_made_up(
-        tmp_path, made.definition(controllers=(thesis.CONTROLLERS[0], changed, thesis.CONTROLLERS[2]))
-    )
+    changed = msgspec.structs.replace(made.CONTROLLERS[1], tuning="thesis-light")
+    run_made_up(tmp_path, made.definition(controllers=(made.CONTROLLERS[0], changed, made.CONTROLLERS[2])))
     assert stubbed == ["step-choke"]
     assert len(list(tmp_path.glob("results-*.zarr"))) == 1
 
@@ -268,7 +265,7 @@ def test_an_interrupted_run_keeps_what_was_done(tmp_path, monkeypatch, stubbed):
 
 def test_bad_requests_are_refused_before_anything_is_written(tmp_path):
     with pytest.raises(InputError, match="plant"):
-        thesis.run_thesis(tmp_path / "out", plant="fmy")
+        catalogue.run_named("thesis", tmp_path / "out", plant="fmy")
     assert not (tmp_path / "out").exists()
 
 
@@ -321,7 +318,7 @@ def test_verdicts_follow_from_the_numbers(results):
 
 def test_the_report_holds_every_controller_and_claim(results):
     text = report.markdown(results)
-    for controller in thesis.CONTROLLERS:
+    for controller in made.CONTROLLERS:
         assert controller.label in text
     assert text.count("\n| ") > 20
     rows = list(csv.DictReader(io.StringIO(report.table_csv(results))))

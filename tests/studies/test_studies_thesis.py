@@ -8,15 +8,20 @@ from figures.thesis import comparison
 from studies.kpi import evaluate
 from studies.store.comparison import open_results
 from studies.thesis import claims
-from studies.thesis import comparison as thesis
+from studies.thesis.catalogue import run_named
 
 
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory):
     """The shortened study on the JAX well."""
     lines = []
-    folder = thesis.run_thesis(
-        tmp_path_factory.mktemp("results"), quick=True, plant="jax", progress=False, say=lines.append
+    folder = run_named(
+        "thesis",
+        tmp_path_factory.mktemp("results"),
+        quick=True,
+        plant="jax",
+        progress=False,
+        say=lines.append,
     )
     return folder, lines
 
@@ -48,14 +53,16 @@ def test_every_figure_is_drawn_and_a_rerun_computes_nothing(quick):
     paths = comparison.draw_all(folder, "thesis")
     assert len(paths) == 2 * sum(entry.study == "thesis" for entry in FIGURES.values())
     lines = []
-    thesis.run_thesis(folder.parent, quick=True, plant="jax", progress=False, say=lines.append)
+    run_named("thesis", folder.parent, quick=True, plant="jax", progress=False, say=lines.append)
     assert sum("stored already" in line for line in lines) == 3
 
 
 @pytest.mark.slow
 def test_the_fmu_and_its_jax_twin_give_the_same_choke_sequence(quick, tmp_path):
     twin = open_results(quick[0]).load()
-    fmu = open_results(thesis.run_thesis(tmp_path, quick=True, progress=False, say=lambda line: None)).load()
+    fmu = open_results(
+        run_named("thesis", tmp_path, quick=True, progress=False, say=lambda line: None)
+    ).load()
     for name in ("step-choke", "mixed-integer"):
         np.testing.assert_allclose(
             fmu.position.sel(controller=name, mv="choke"),

@@ -13,11 +13,12 @@ from jaxmpc.controller.mixed_integer import MixedIntegerController
 from jaxmpc.controller.plan import Plan
 from jaxmpc.relaxed.solve import shifted_start
 from studies.bench import forms
-from studies.bench.context import Context, absent, ask, asked
-from studies.bench.instances import Instances, make_controller
-from studies.bench.judge import Judge, ratio, time_each
-from studies.bench.peers import Peer, piqp
-from studies.bench.rows import RIGHT, Goal, Row, timed
+from studies.bench.beside import Contest
+from studies.bench.context import Context
+from studies.bench.instances import Instances, Mode, make_controller
+from studies.bench.judge import time_each
+from studies.bench.peers import piqp
+from studies.bench.rows import Goal, Row
 
 GAP = 1e-6  # relative, as the controllers ask for
 PATIENCE = 30.0  # s; most that one of our solves may take
@@ -33,97 +34,45 @@ WAYS = {"auto": "jaxmpc", "highs": "jaxmpc, HiGHS finish"}
 def exact(context: Context) -> Iterator[Row]:
     """Rows ``exact MIQP, MODE: SOLVER``; the ratio is to SCIP."""
     for mode in context.size.modes:
-        context.say(f"exact MIQP, {mode}")
+        name = f"exact MIQP, {mode}"
+        context.say(name)
         instances = context.recordings.instances("mixed-integer", mode, context.size.exact)
-        yield from _beside_peers(context, mode, instances)
-        context.say(f"exact MIQP, {mode}: longest solves")
+        contest = Contest(
+            context, "exact", name, instances.cases(), context.miqp_peers, 1e-7, _polished, in_time=True
+        )
+        _enter_ours(contest, mode, instances)
+        contest.ask_peers()
+        for finish, label in WAYS.items():
+            median, p99 = FLOORS[finish, mode]
+            goals = (Goal("median_ms", median), Goal("p99_ms", p99))
+            goals += (Goal("ratio", 1000.0, 5000.0),) if finish == "auto" else ()
+            note = "wall time of Planner.solve, started as in the loop, all programs compiled"
+            yield contest.row(finish, label, goals=goals, note=note)
+        yield from contest.peer_rows()
+        context.say(f"{name}: longest solves")
         hardest = context.recordings.instances("mixed-integer", mode, context.size.hardest, hardest=True)
-        judge, name = (
-            Judge([hardest.case(i) for i in range(len(hardest))]),
-            f"exact MIQP, {mode}, longest solves",
-        )
-        found = {finish: _ours(mode, hardest, finish, judge) for finish in WAYS}
-        for finish, seconds in found.items():
-            yield timed(
-                f"{name}: {WAYS[finish]}",
-                "exact",
-                seconds,
-                judge.errors(finish),
-                note=f"the {len(hardest)} samples of the run that took longest; the ways to finish check each other",
-            )
+        contest = Contest(context, "exact", f"{name}, longest solves", hardest.cases())
+        _enter_ours(contest, mode, hardest)
+        note = f"the {len(hardest)} samples of the run that took longest; the ways to finish check each other"
+        for finish, label in WAYS.items():
+            yield contest.row(finish, label, note=note)
 
 
-def _beside_peers(context: Context, mode, instances: Instances) -> Iterator[Row]:
-    name, cases = f"exact MIQP, {mode}", [instances.case(i) for i in range(len(instances))]
-    judge = Judge(cases)
-    ours = {}
-    for finish in WAYS:
-        context.say(f"{name}: {WAYS[finish]}")
-        ours[finish] = _ours(mode, instances, finish, judge)
-    theirs: dict[str, tuple[np.ndarray, np.ndarray, list[Any]]] = {}
-    missing = {
-        peer.name: absent(peer, context, "exact", f"{name}: {peer.name}") for peer in context.miqp_peers
-    }
-    for peer in context.miqp_peers:
-        if missing[peer.name] is None:
-            context.say(f"{name}: {peer.name}")
-            at = asked(peer, context, len(cases))
-            try:
-                seconds, answers, plans = ask(peer, context, [cases[i] for i in at], 1e-7)
-            except Exception as error:  # a licence that is too small shows only when it is used
-                why = " ".join(str(error).split())
-                missing[peer.name] = Row(
-                    name=f"{name}: {peer.name}", section="exact", status="failed", note=why
-                )
-                continue
-            judge.hear(peer.name, [_polished(cases[i], plan) for i, plan in zip(at, plans, strict=True)], at)
-            theirs[peer.name] = at, seconds, answers
-    reference = context.miqp_peers[0].name
-    known = theirs.get(reference)
-    for finish, seconds in ours.items():
-        median, p99 = FLOORS[finish, mode]
-        goals = [Goal("median_ms", median), Goal("p99_ms", p99)]
-        row = timed(
-            f"{name}: {WAYS[finish]}",
-            "exact",
-            seconds,
-            judge.errors(finish),
-            note="wall time of Planner.solve, started as in the loop, all programs compiled",
-        )
-        if known is not None:
-            row.ratio, row.ratio_to = ratio(seconds, known[1], known[0]), reference
-            row.ratio_is_lower_bound = any(answer.status == "limit" for answer in known[2])
-        if finish == "auto":
-            goals.append(Goal("ratio", 1000.0, 5000.0))
-        row.goals = tuple(goals)
-        yield row
-    for peer in context.miqp_peers:
-        yield missing[peer.name] or _peer_row(context, f"{name}: {peer.name}", peer, theirs[peer.name], judge)
+def _enter_ours(contest: Contest, mode: Mode, instances: Instances) -> None:
+    """Solve all problems in each of our ways to finish."""
+    for finish, label in WAYS.items():
+        contest.context.say(f"{contest.name}: {label}")
+        controller = make_controller("mixed-integer", mode, instances.model)
+        problems = [_as_in_the_loop(controller, instances, i) for i in range(len(instances))]
+        limits = {"gap": GAP, "finish": finish, "time_limit": PATIENCE}
 
+        def solve(problem: dict[str, Any], planner=controller.planner, limits=limits) -> Plan:
+            return planner.solve(**problem, **limits)
 
-def _peer_row(context: Context, name: str, peer: Peer, found, judge: Judge) -> Row:
-    """A peer's row; problems that it did not finish in time are not solved, whatever it had by then."""
-    _, seconds, answers = found
-    finished = np.array([answer.status == "optimal" for answer in answers])
-    row = timed(name, "exact", seconds, np.where(finished, judge.errors(peer.name), np.nan))
-    row.counts = row.worst_error is None or row.worst_error <= RIGHT
-    row.note = f"{peer.timed}; stopped after {min(peer.hopeless, context.size.cut_off):g} s"
-    return row
-
-
-def _ours(mode, instances: Instances, finish: str, judge: Judge) -> np.ndarray:
-    """Seconds of our solves; their plans go to the judge under the name of the way to finish."""
-    controller = make_controller("mixed-integer", mode, instances.model)
-    problems = [_as_in_the_loop(controller, instances, i) for i in range(len(instances))]
-
-    def solve(i: int) -> Plan:
-        return controller.planner.solve(**problems[i], gap=GAP, finish=finish, time_limit=PATIENCE)
-
-    for i in range(len(problems)):  # compiles every form that these problems meet
-        solve(i)
-    seconds, plans = time_each(solve, len(problems))
-    judge.hear(finish, [plan.moves if plan.status == "optimal" else None for plan in plans])
-    return seconds
+        for problem in problems:  # compiles every form that these problems meet
+            solve(problem)
+        seconds, plans = time_each(solve, problems)
+        contest.enter(finish, seconds, [plan.moves if plan.status == "optimal" else None for plan in plans])
 
 
 def _as_in_the_loop(controller: MixedIntegerController, instances: Instances, i: int) -> dict[str, Any]:

@@ -9,12 +9,13 @@ import numpy as np
 from jaxmpc.model.step_response import make_model
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import make_tuning
-from studies.bench.context import Context, ask
+from studies.bench.beside import ask
+from studies.bench.context import Context
 from studies.bench.instances import Instances, Problems
 from studies.bench.judge import Judge
 from studies.bench.lanes import Lanes
-from studies.bench.rows import Row, timed
-from studies.bench.sections.relaxed import TOLERANCE, clock
+from studies.bench.rows import Row, batched
+from studies.bench.sections.relaxed import TOLERANCE, batch_times
 
 LANES = 32
 THESIS_LIKE = {"horizon": 250, "blocks": 16, "CVs": 2, "MVs": 2}
@@ -23,30 +24,21 @@ THESIS_LIKE = {"horizon": 250, "blocks": 16, "CVs": 2, "MVs": 2}
 def growth(context: Context) -> Iterator[Row]:
     """Rows ``growth, HORIZON x BLOCKS x CVS x MVS``: one dimension varied, the others as in the thesis."""
     peer = context.qp_peers[0]
+    others = ", ".join(f"{name} {value}" for name, value in THESIS_LIKE.items())
+    note = f"random stable models, batch of {LANES}, cold; time per QP; other sizes {others}"
     for axis, sizes in context.size.growth:
         for size in sizes:
-            shape = {**THESIS_LIKE, axis: size}
             context.say(f"growth, {size} {axis}")
-            instances = random_instances(np.random.default_rng(size), shape, LANES)
-            cases = [instances.case(i) for i in range(LANES)]
-            judge, lanes = Judge(cases), Lanes(instances)
-            batch = lanes.batch(lanes.cold, LANES)
-            solution = lanes.solve_batch(batch)
-            seconds = min(clock(lanes, batch) for _ in range(3))
-            judge.hear("jaxmpc", lanes.plans(solution.x))
-            times = None
+            instances = random_instances(np.random.default_rng(size), {**THESIS_LIKE, axis: size}, LANES)
+            judge, lanes = Judge(instances.cases()), Lanes(instances)
+            times, _ = batch_times(lanes, judge, "jaxmpc", "cold", LANES, 3)
+            seconds, ratio = min(times), None
             if peer.missing() is None:
-                taken, _, plans = ask(peer, context, cases, TOLERANCE)
+                theirs, _, plans = ask(peer, context, judge.cases, TOLERANCE)
                 judge.hear(peer.name, plans)
-                times = float(taken.sum()) / seconds
-            row = timed(f"growth, {axis} {size}", "growth", np.full(1, seconds), judge.errors("jaxmpc"))
-            row.median_ms, row.p99_ms = seconds / LANES * 1e3, None
-            row.rate, row.seconds = LANES / seconds, seconds
-            row.ratio, row.ratio_to = times, f"{peer.name} (one core)"
-            row.note = f"random stable models, batch of {LANES}, cold; time per QP; other sizes " + ", ".join(
-                f"{name} {value}" for name, value in THESIS_LIKE.items()
-            )
-            yield row
+                ratio = float(theirs.sum()) / seconds
+            name, errors, to = f"growth, {axis} {size}", judge.errors("jaxmpc"), f"{peer.name} (one core)"
+            yield batched(name, "growth", seconds, LANES, errors, ratio=ratio, ratio_to=to, note=note)
 
 
 def random_instances(rng: np.random.Generator, shape: dict[str, int], lanes: int) -> Instances:

@@ -7,25 +7,26 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxmpc.controller.plan import Planner
 from studies.bench.context import Context
-from studies.bench.judge import Judge
-from studies.bench.rows import Goal, Row, timed
+from studies.bench.judge import Judge, taken
+from studies.bench.rows import Goal, Row, whole
 
 PATIENCE = 600.0  # s
+CALLS = {"first": "nothing compiled before", "second": "compiled programs taken from disk"}
 
 
 def startup(context: Context) -> Iterator[Row]:
     """Rows ``first call, MODE``: `jaxmpc plan` on a recorded sample with an empty compilation cache, and again."""
     for mode in context.size.startup_modes:
         instances = context.recordings.instances("mixed-integer", mode, 5)
-        cases = [instances.case(i) for i in range(len(instances))]
+        cases = instances.cases()
         # a case file has no limits of the first move alone
         free = [
             i
@@ -40,18 +41,18 @@ def startup(context: Context) -> Iterator[Row]:
         problem["past_moves"] = None
         judge.hear("in process", [planner.solve(**problem).moves])
         with tempfile.TemporaryDirectory(prefix="jaxmpc-bench-") as folder:
-            for call in ("first", "second"):
+            for call, words in CALLS.items():
                 context.say(f"{call} call, {mode}")
                 seconds, plan = _plan(case, Path(folder))
                 judge.hear(call, [plan])
-                row = timed(f"{call} call, {mode}", "startup", np.full(1, seconds), judge.errors(call))
-                row.median_ms = row.p99_ms = row.rate = None
-                row.seconds = seconds
-                row.goals = (Goal("seconds", 30.0, 8.0),) if call == "first" else ()
-                row.note = "`jaxmpc plan` in a process of its own, " + (
-                    "nothing compiled before" if call == "first" else "compiled programs taken from disk"
+                yield whole(
+                    f"{call} call, {mode}",
+                    "startup",
+                    seconds,
+                    judge.errors(call),
+                    goals=(Goal("seconds", 30.0, 8.0),) if call == "first" else (),
+                    note=f"`jaxmpc plan` in a process of its own, {words}",
                 )
-                yield row
 
 
 def _plan(case: dict, folder: Path) -> tuple[float, np.ndarray | None]:
@@ -62,9 +63,8 @@ def _plan(case: dict, folder: Path) -> tuple[float, np.ndarray | None]:
     for name in ("JAX_COMPILATION_CACHE_DIR", "JAXMPC_NO_JIT_CACHE"):
         environment.pop(name, None)
     command = [sys.executable, "-m", "jaxmpc.cli", "plan", str(given), "--out", str(out)]
-    begin = time.perf_counter()
-    subprocess.run(command, env=environment, check=False, timeout=PATIENCE, capture_output=True)
-    seconds = time.perf_counter() - begin
+    limits: dict[str, Any] = {"check": False, "timeout": PATIENCE, "capture_output": True}
+    seconds, _ = taken(lambda: subprocess.run(command, env=environment, **limits))
     moves = json.loads(out.read_text())["moves"] if out.exists() else None
     out.unlink(missing_ok=True)
     return seconds, None if moves is None else np.array(moves)

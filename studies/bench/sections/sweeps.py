@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,9 @@ import numpy as np
 
 from jaxmpc.errors import InputError
 from studies.bench.context import Context
+from studies.bench.judge import taken
 from studies.bench.rows import Goal, Row
+from studies.definition.scenarios import Study
 from studies.definition.sweep import StudyDefinition
 from studies.run.chunk import stored_variables
 from studies.run.runner import run_study
@@ -23,6 +25,7 @@ from studies.store.reading import chunk_facts, kpi_frame
 from studies.store.sweep import SweepStore
 
 CHUNK = 64
+QUIET: dict[str, Any] = {"progress": False, "say": lambda _: None}
 SHARE = 0.05  # of the time of the closed loops that everything else may take
 GROWTH = 1.1  # of the peak memory when there are many times as many scenarios
 
@@ -40,51 +43,55 @@ def sweeps(context: Context) -> Iterator[Row]:
 
 def _overhead(context: Context, folder: Path, chunks: int, samples: int) -> Row:
     context.say(f"{chunks} chunks of {CHUNK} continuous scenarios, {samples} samples, stored")
-    run_study(_study(1, samples), folder / "warm.zarr", progress=False, say=lambda _: None)
-    begin = time.perf_counter()
-    path = run_study(_study(chunks, samples), folder / "overhead.zarr", progress=False, say=lambda _: None)
-    elapsed = time.perf_counter() - begin
+    run_study(_study(1, samples), folder / "warm.zarr", **QUIET)
+    study = _study(chunks, samples)
+    elapsed, path = taken(lambda: run_study(study, folder / "overhead.zarr", **QUIET))
     simulated = sum(facts["simulation_time"] for facts in chunk_facts(path).values())
     frame = kpi_frame(path)
-    row = Row(name=f"sweep: all but the closed loops, {chunks} chunks of {CHUNK}", section="sweep")
-    row.instances, row.solved = len(frame), int(np.asarray(frame["complete"]).sum())
-    row.seconds = elapsed - simulated
-    row.goals = (Goal("seconds", SHARE * simulated),)
-    row.counts = row.solved == row.instances
-    row.note = (
-        f"runner, key figures and store in {elapsed:.1f} s, of which {simulated:.1f} s are closed loops: "
-        f"{100 * row.seconds / simulated:.1f} %; the floor is {100 * SHARE:.0f} %, compiled before"
+    solved, rest = int(np.asarray(frame["complete"]).sum()), elapsed - simulated
+    return Row(
+        name=f"sweep: all but the closed loops, {chunks} chunks of {CHUNK}",
+        section="sweep",
+        instances=len(frame),
+        solved=solved,
+        seconds=rest,
+        goals=(Goal("seconds", SHARE * simulated),),
+        counts=solved == len(frame),
+        note=f"runner, key figures and store in {elapsed:.1f} s, of which {simulated:.1f} s are closed loops: "
+        f"{100 * rest / simulated:.1f} %; the floor is {100 * SHARE:.0f} %, compiled before",
     )
-    return row
 
 
 def _opening(context: Context, folder: Path, count: int) -> Row:
     context.say(f"key figures of {count} stored scenarios")
-    path = _made_up(folder / "opening.zarr", count)
-    begin = time.perf_counter()
-    frame = kpi_frame(path)
-    row = Row(name=f"sweep: key figures of {count} scenarios as a table", section="sweep")
-    row.seconds = time.perf_counter() - begin
-    row.instances, row.solved = count, int((np.asarray(frame["choke_travel"]) == np.arange(count)).sum())
-    row.counts = row.solved == count
-    row.goals = (Goal("seconds", 2.0),) if count >= 10_000 else ()
-    return row
+    layout = _layout(count, CHUNK)
+    with _made_up(folder / "opening.zarr", layout, len(layout.chunk_scenarios)) as store:
+        path = store.path
+    seconds, frame = taken(lambda: kpi_frame(path))
+    solved = int((np.asarray(frame["choke_travel"]) == np.arange(count)).sum())
+    return Row(
+        name=f"sweep: key figures of {count} scenarios as a table",
+        section="sweep",
+        instances=count,
+        solved=solved,
+        seconds=seconds,
+        goals=(Goal("seconds", 2.0),) if count >= 10_000 else (),
+        counts=solved == count,
+    )
 
 
 def _resuming(context: Context, folder: Path, chunks: int) -> Row:
     context.say(f"what is missing of {chunks} chunks")
-    layout = _layout(chunks * 2, 2)
-    with SweepStore.begin(folder / "resuming.zarr", layout, say=lambda _: None) as store:
-        for i in range(chunks - 1):
-            store.commit(i, _fields(layout, i), {})
-        begin = time.perf_counter()
-        missing = store.pending()
-        seconds = time.perf_counter() - begin
-    row = Row(name=f"sweep: what is missing of {chunks} chunks", section="sweep", seconds=seconds)
-    row.counts = missing == [chunks - 1]
-    row.instances = chunks
-    row.goals = (Goal("seconds", 1.0),) if chunks >= 1000 else ()
-    return row
+    with _made_up(folder / "resuming.zarr", _layout(chunks * 2, 2), chunks - 1) as store:
+        seconds, missing = taken(store.pending)
+    return Row(
+        name=f"sweep: what is missing of {chunks} chunks",
+        section="sweep",
+        instances=chunks,
+        seconds=seconds,
+        goals=(Goal("seconds", 1.0),) if chunks >= 1000 else (),
+        counts=missing == [chunks - 1],
+    )
 
 
 def _memory(context: Context, folder: Path, chunks: tuple[int, int]) -> Iterator[Row]:
@@ -107,7 +114,7 @@ def _memory(context: Context, folder: Path, chunks: tuple[int, int]) -> Iterator
         yield row
 
 
-def _study(chunks: int, samples: int):
+def _study(chunks: int, samples: int) -> Study:
     body = {
         "study": {"name": "bench", "chunk_size": CHUNK, "confirmation_limit": 10**6},
         "base": {"actuator": "step", "reference": "quick", "duration": 10.0 * samples},
@@ -141,19 +148,19 @@ def _fields(layout: StoreLayout, chunk: int) -> dict[str, Any]:
     numbers = layout.chunk_scenarios[chunk].astype(float)
     fields = {}
     for variable in layout.variables:
-        shape = (len(numbers), *layout.shape(variable))
-        fields[variable.name] = np.broadcast_to(numbers.reshape(-1, *[1] * (len(shape) - 1)), shape).astype(
-            variable.dtype
-        )
+        shape = layout.shape(variable)
+        wide = np.broadcast_to(numbers.reshape(-1, *[1] * len(shape)), (len(numbers), *shape))
+        fields[variable.name] = wide.astype(variable.dtype)
     return fields
 
 
-def _made_up(path: Path, count: int) -> Path:
-    layout = _layout(count, CHUNK)
+@contextlib.contextmanager
+def _made_up(path: Path, layout: StoreLayout, chunks: int) -> Iterator[SweepStore]:
+    """A store with its first chunks filled."""
     with SweepStore.begin(path, layout, say=lambda _: None) as store:
-        for i in range(len(layout.chunk_scenarios)):
+        for i in range(chunks):
             store.commit(i, _fields(layout, i), {})
-    return path
+        yield store
 
 
 def _peak_megabytes() -> float:
@@ -166,5 +173,5 @@ def _peak_megabytes() -> float:
 
 
 if __name__ == "__main__":  # one measurement of memory, in a process of its own
-    run_study(_study(int(sys.argv[1]), 20), Path(sys.argv[2]), progress=False, say=lambda _: None)
+    run_study(_study(int(sys.argv[1]), 20), Path(sys.argv[2]), **QUIET)
     print(_peak_megabytes())

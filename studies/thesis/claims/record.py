@@ -1,7 +1,7 @@
 """How a statement of the thesis becomes a measured row: what is said, how it is measured, when it holds, what came out.
 
-The words of a row stand once, in its `Row`; `judge` adds the numbers and the verdict that follows from them by the rule of
-the row. A statement that fails is shown as failing.
+The words of a row stand once, in ``rows.toml``; `claim_of` adds the numbers and the verdict that follows from them by the
+rule of the row. A statement that fails is shown as failing.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -17,20 +17,21 @@ import xarray as xr
 
 from studies.definition.presets import CHOKE, GAS, LIFT, OIL
 from studies.kpi.evaluate import completed, key_figures
+from studies.kpi.loop import moves_of, travel
+from studies.thesis.claims import limits
+from studies.thesis.claims.limits import LATE
 
 VERDICTS = ("holds", "holds in part", "does not hold", "not tested")
-STATIONARY = 0.25  # deadzone half widths of mean deviation that count as arrived
-LATE = 600.0  # s at the end of a stretch that stand for what it settles at
-SETTLED = f"mean of y - r over the last {LATE:.0f} s"
 ROLES = {  # by kind of controller and actuator, whatever the run is called
     ("continuous", "continuous"): "smooth",
     ("continuous", "step"): "rounded",
     ("mixed-integer", "step"): "integer",
 }
+Condition = bool | np.bool_
 
 
-class Claim(msgspec.Struct, frozen=True):
-    """One statement of the thesis and what the results say.
+class Statement(msgspec.Struct, frozen=True):
+    """One statement of the thesis.
 
     Attributes:
         id: short and unique.
@@ -38,11 +39,8 @@ class Claim(msgspec.Struct, frozen=True):
         statement: the thesis, in our words.
         definition: how it is measured.
         rule: when it counts as holding.
-        value: the numbers, with units.
-        verdict: one of `VERDICTS`.
-        reason: what the data say about why it does not hold; empty if it does.
-        figures: ids of the figures that show it.
         study: of `studies.thesis.catalogue.STUDIES`, whose results are measured.
+        figures: ids of the figures that show it.
     """
 
     id: str
@@ -50,25 +48,71 @@ class Claim(msgspec.Struct, frozen=True):
     statement: str
     definition: str
     rule: str
+    study: str
+    figures: tuple[str, ...]
+
+
+class Claim(Statement, frozen=True):
+    """A statement and what the results say.
+
+    Attributes:
+        value: the numbers, with units.
+        verdict: one of `VERDICTS`.
+        reason: what the data say about why it does not hold; empty if it does.
+    """
+
     value: str
     verdict: str
     reason: str
-    figures: tuple[str, ...]
-    study: str
+
+    def written(self) -> dict[str, Any]:
+        """The fields by name in the order of the files."""
+        words = ("id", "section", "statement", "definition", "rule")
+        return {
+            name: getattr(self, name) for name in (*words, "value", "verdict", "reason", "figures", "study")
+        }
 
 
 class Finding(NamedTuple):
     """What a measurement gives.
 
     Attributes:
-        value: the numbers, with units.
         conditions: those of the rule; none if it cannot be tested on these results.
-        reason: shown unless all conditions are met.
+        numbers: for the words of the row, by name.
+        why: which of its reasons is shown unless all conditions are met, where it has several.
+        instead: of the words of the row on its numbers.
     """
 
+    conditions: tuple[Condition, ...]
+    numbers: dict[str, Any]
+    why: str = ""
+    instead: str = ""
+
+
+class Row(Statement, frozen=True, forbid_unknown_fields=True):
+    """A statement that can be measured, from ``rows.toml``.
+
+    Attributes:
+        needs: roles or names of the runs that the measurement is given.
+        measure: function that takes the evidence and the names of `needs`, as ``module.function``.
+        value: words for its numbers.
+        reason: words for why it fails, or several by what the measurement says.
+    """
+
+    needs: tuple[str, ...]
+    measure: str
     value: str
-    conditions: tuple[bool, ...]
-    reason: str = ""
+    reason: str | dict[str, str]
+
+
+class Rates:
+    """One number per CV, formatted as ``oil +1.2 and gas -30``."""
+
+    def __init__(self, values: np.ndarray, cvs: np.ndarray):
+        self.by_name = {str(cv): float(value) for cv, value in zip(cvs, values, strict=True)}
+
+    def __format__(self, form: str) -> str:
+        return f"oil {self.by_name[OIL]:{form}} and gas {self.by_name[GAS]:{form}}"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -86,9 +130,14 @@ class Evidence:
     given: xr.Dataset | None = None
 
     @classmethod
-    def of(cls, data: xr.Dataset, clock: Callable[[str], np.ndarray] | None = None) -> Evidence:
+    def of(
+        cls,
+        data: xr.Dataset,
+        clock: Callable[[str], np.ndarray] | None = None,
+        given: xr.Dataset | None = None,
+    ) -> Evidence:
         """From results with at least one finished run."""
-        return cls(completed(data).load(), clock)
+        return cls(completed(data).load(), clock, given)
 
     @functools.cached_property
     def key(self) -> xr.Dataset:
@@ -108,16 +157,24 @@ class Evidence:
         """The results of one run."""
         return self.data.sel(controller=self.roles[role])
 
+    def figure(self, name: str, role: str) -> Any:
+        """A key figure of one run: a number or an array."""
+        return self.key[name].sel(controller=self.roles[role]).values[()]
+
     def half(self, role: str) -> np.ndarray:
         """Half widths of the deadzone, ``"cv"`` [CV unit]."""
         return self.run(role).tuning_deadzone.values
 
-    def starts(self, windows: np.ndarray) -> str:
-        """Starts of some setpoint windows [s] in words, from a mask ``"window"``."""
-        first = [
-            float(self.data.time.values[self.data.window.values == w][0]) for w in np.flatnonzero(windows)
-        ]
-        return f"window{'s' if len(first) > 1 else ''} from {', '.join(f'{start:,.0f}' for start in first)} s"
+    def rates(self, values: np.ndarray) -> Rates:
+        """Numbers ``"cv"`` for the words of a row."""
+        return Rates(values, self.data.cv.values)
+
+    def starts(self, windows: np.ndarray | int) -> str:
+        """Starts of some setpoint windows [s] in words, from a mask ``"window"`` or the number of one."""
+        label = self.data.window.values
+        which = [windows] if isinstance(windows, int) else np.flatnonzero(windows)
+        first = [f"{float(self.data.time.values[label == w][0]):,.0f}" for w in which]
+        return f"window{'s' if len(first) > 1 else ''} from {', '.join(first)} s"
 
     def times(self, role: str) -> np.ndarray:
         """Times of the controller steps [s], ``"sample"``."""
@@ -125,48 +182,20 @@ class Evidence:
         return self.run(role).solve_time.values if self.clock is None else self.clock(name)
 
 
-@dataclasses.dataclass(frozen=True)
-class Row:
-    """A statement that can be measured.
-
-    Attributes:
-        id, section, statement, definition, rule, study, figures: as in `Claim`.
-        needs: roles or names of the runs that the measurement uses.
-        measure: numbers and conditions from the evidence.
-    """
-
-    id: str
-    section: str
-    statement: str
-    definition: str
-    rule: str
-    study: str
-    figures: tuple[str, ...]
-    needs: tuple[str, ...]
-    measure: Callable[[Evidence], Finding]
-
-
-def judge(row: Row, evidence: Evidence | None) -> Claim:
-    """Measure one row; without its runs it is not tested.
-
-    Args:
-        row: the statement.
-        evidence: results of its study, None if there are none.
-    """
-    missing = [name for name in row.needs if evidence is None or name not in evidence.roles]
-    if evidence is None or missing:
-        found = Finding(f"no finished run of {', '.join(missing) or row.study}", ())
-    else:
-        found = row.measure(evidence)
+def claim_of(row: Row, found: Finding) -> Claim:
+    """The words of a row with the numbers of its measurement, and the verdict."""
     said = verdict(*found.conditions) if found.conditions else VERDICTS[3]
-    words = {
-        name: getattr(row, name)
-        for name in ("id", "section", "statement", "definition", "rule", "figures", "study")
-    }
-    return Claim(**words, value=found.value, verdict=said, reason="" if said == VERDICTS[0] else found.reason)
+    numbers = vars(limits) | found.numbers
+    reason = row.reason if isinstance(row.reason, str) else row.reason.get(found.why, "")
+    return Claim(
+        *(getattr(row, name) for name in Statement.__struct_fields__),
+        value=found.instead or row.value.format_map(numbers),
+        verdict=said,
+        reason=reason.format_map(numbers) if said in VERDICTS[1:3] else "",
+    )
 
 
-def verdict(*conditions: bool) -> str:
+def verdict(*conditions: Condition) -> str:
     """Holds if all conditions are met, in part if some are."""
     if all(conditions):
         return VERDICTS[0]
@@ -195,6 +224,12 @@ def late_deviation(run: xr.Dataset) -> np.ndarray:
     return (end.measurement - end.setpoint).mean("time").values
 
 
+def choke_travel(run: xr.Dataset) -> float:
+    """Travel of the actual choke position from the first sample on [%]."""
+    position = run.position.sel(mv=CHOKE).values
+    return float(travel(moves_of(position, position[0])))
+
+
 def quarters(window: np.ndarray) -> list[np.ndarray]:
     """Samples of the last quarter of every setpoint window."""
     out = []
@@ -204,7 +239,6 @@ def quarters(window: np.ndarray) -> list[np.ndarray]:
     return out
 
 
-def both(values: np.ndarray, cvs: np.ndarray, form: str, unit: str = "m3/h") -> str:
-    """``oil +1.2 and gas -30 m3/h``: one number per CV, oil first."""
-    at = {str(cv): float(value) for cv, value in zip(cvs, values, strict=True)}
-    return f"oil {at[OIL]:{form}} and gas {at[GAS]:{form}}{f' {unit}' if unit else ''}"
+def swing(values: np.ndarray, groups: list[np.ndarray]) -> np.ndarray:
+    """Largest minus smallest value in groups of samples, ``"group channel"``."""
+    return np.array([np.ptp(values[samples], axis=0) for samples in groups])

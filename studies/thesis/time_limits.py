@@ -1,0 +1,96 @@
+"""What limited solve times cost the plans of stored runs, against the exact optimum of the very same steps.
+
+`studies.thesis.report` writes it into the summary of the comparison ``time-limit``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from jaxmpc.controller.continuous import ControllerState, Memory
+from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.status import LIMIT
+from studies.definition.comparison import ControllerDefinition
+
+
+class LimitedSteps(NamedTuple):
+    """The steps of a run that ended at their time limit.
+
+    Attributes:
+        label: of the controller.
+        share: of all steps, 0..1.
+        gap: median of the relative gaps that were proven.
+        lost: relative to the exact optimum of the same step, the median, the 90th percentile and the most.
+    """
+
+    label: str
+    share: float
+    gap: float
+    lost: tuple[float, float, float]
+
+
+def limited_steps(
+    data: xr.Dataset, definitions: Iterable[ControllerDefinition], model: StepResponseModel
+) -> list[LimitedSteps]:
+    """What the time limits of stored runs cost, one entry per controller with a limit; NaN where no step reached it.
+
+    Args:
+        data: results from `studies.store.comparison.open_results`, every run finished.
+        definitions: of the controllers that ran.
+        model: their prediction model, ``model.json`` in the folder of the study.
+    """
+    out = []
+    for definition in definitions:
+        if definition.time_limit is None:
+            continue
+        run = data.sel(controller=definition.name)
+        at = run.status.values == LIMIT
+        gap, lost = np.nan, (np.nan, np.nan, np.nan)
+        if at.any():
+            loss = objective_loss(data, definition, model)[at]
+            gap = float(np.median(run.gap.values[at]))
+            lost = tuple(np.nanpercentile(loss, (50, 90, 100)).tolist())
+        out.append(LimitedSteps(definition.label, float(at.mean()), gap, lost))
+    return out
+
+
+def objective_loss(
+    data: xr.Dataset, definition: ControllerDefinition, model: StepResponseModel
+) -> np.ndarray:
+    """What a time limit cost every plan of a stored run, ``"sample"``: objective over the exact optimum, less one.
+
+    The state of the controller is replayed from the stored measurements and plans, and the steps that ended at the limit
+    are solved again without one. Zero for steps that were solved to the end, not a number for steps without a plan.
+
+    Args:
+        data: results from `studies.store.comparison.open_results`.
+        definition: of the controller that ran.
+        model: its prediction model, ``model.json`` in the folder of the study.
+    """
+    run = data.sel(controller=definition.name).load()
+    exact = MixedIntegerController(definition.structure(), definition.build_tuning(), model)
+    cv, setpoint, move = run.measurement.values, run.setpoint.values, run.move.values
+    plan = run.plan.values[:, : definition.structure().block_count]
+    status, objective = run.status.values, run.objective.values
+    loss = np.where(np.isfinite(objective), 0.0, np.nan)
+    state, memory = exact.init(cv[0], run.demand.values[0] - move[0]), exact.memory
+    for k in range(len(cv)):
+        if status[k] == LIMIT and np.isfinite(objective[k]):
+            best = float(exact.step(state, cv[k], setpoint[k])[1].objective)
+            loss[k] = max(objective[k] / best - 1.0, 0.0)
+        state = _replayed(memory, state, cv[k], move[k], plan[k])
+    return loss
+
+
+@jax.jit
+def _replayed(memory: Memory, state: ControllerState, cv, move, plan) -> ControllerState:
+    """The state one sample later, for a move that was made."""
+    state, _ = memory.observe(state, jnp.asarray(cv))
+    return memory.remember(state, move, plan, state.warm)
