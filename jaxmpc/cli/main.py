@@ -381,7 +381,7 @@ def _bench(options: argparse.Namespace) -> int:
     report = run_bench(quick=options.quick, only=only, json_path=out, stopped=show)
     show(report)
     if folder is not None:
-        from figures.benchmark import draw_benchmark
+        from figures.thesis.solve_time import draw_benchmark
 
         for path in draw_benchmark(json.loads(report.to_json()), folder):
             print(path, file=sys.stderr)
