@@ -2,61 +2,49 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
 from figures import panels, style
-from figures.benchmark import two_digits
-from figures.entry import FigureEntry
-from figures.thesis.thesis_captions import compiled_note
+from figures.figure import FigureEntry
+from figures.thesis.solve_time import MILLISECONDS, time_note, two_digits
 from studies.definition.presets import CHOKE, OIL
 
 BLOCKS, SINGLE = "blocks", "no-blocks"
-TIMED = {  # name: label, colour
-    BLOCKS: ("continuous, 16 blocks", style.BLUE),
-    SINGLE: ("continuous, 200 moves", style.ORANGE),
-    "mixed-integer-blocks": ("mixed-integer, 16 blocks", style.GREEN),
-    "mixed-integer-no-blocks": ("mixed-integer, 200 moves", style.PURPLE),
+TIMED: dict[str, dict[str, Any]] = {
+    BLOCKS: {"label": "continuous, 16 blocks", "color": style.BLUE},
+    SINGLE: {"label": "continuous, 200 moves", "color": style.ORANGE},
+    "mixed-integer-blocks": {"label": "mixed-integer, 16 blocks", "color": style.GREEN},
+    "mixed-integer-no-blocks": {"label": "mixed-integer, 200 moves", "color": style.PURPLE},
 }
-MILLISECONDS = 1e3  # of a second
+PAIR: dict[str, dict[str, Any]] = {  # both curves are seen where they are one
+    BLOCKS: TIMED[BLOCKS],
+    SINGLE: {**TIMED[SINGLE], "linestyle": (0, (4, 3))},
+}
 
 
-@contextlib.contextmanager
-def draw(data: xr.Dataset) -> Iterator[Figure]:
-    """Oil rate and choke of the continuous controllers; time of every step of all that have run.
-
-    Args:
-        data: results of the study ``unblocked``.
-    """
-    with style.figure(3, row_height=2.1) as (drawn, (rate, choke, times)):
-        seconds = panels.time_axis(times, *panels.span(data))
-        panels.deadzone_lines(rate, data, BLOCKS, OIL, seconds)
-        for name in (BLOCKS, SINGLE):
-            label, colour = TIMED[name]
-            panels.measured(rate, data, name, OIL, seconds, label, colour)
-            panels.manipulated(choke, data, name, CHOKE, seconds, legend=False, label=label, colour=colour)
-        for ax in (rate, choke):
-            ax.lines[-1].set_linestyle((0, (4, 3)))  # both curves of a pair are seen where they are one
-        panels.setpoint(rate, data, OIL, seconds)
-        panels.legend_above(rate, 4)
-        for name in _timed(data):
-            label, colour = TIMED[name]
-            milliseconds = MILLISECONDS * data.solve_time.sel(controller=name).values
-            times.plot(data.time.values / seconds, milliseconds, ".", markersize=3, color=colour, label=label)
-        times.set_yscale("log")
-        times.set_ylabel("time per sample [ms]")
-        panels.legend_above(times, 2)
-        yield drawn
+def draw(data: xr.Dataset) -> Figure:
+    """Three plots over time: oil rate and choke position of two controllers, and time per sample of each controller."""
+    drawn, (rate, choke, times) = style.figure(3, row_height=2.1)
+    seconds = panels.time_axis(times, *panels.span(data))
+    for ax, channel in ((rate, OIL), (choke, CHOKE)):
+        panels.compared(ax, data, channel, PAIR, seconds, BLOCKS)
+    panels.legend_above(rate, 4)
+    for name in _timed(data):
+        milliseconds = MILLISECONDS * data.solve_time.sel(controller=name).values
+        times.plot(data.time.values / seconds, milliseconds, ".", markersize=3, **TIMED[name])
+    times.set_yscale("log")
+    times.set_ylabel("time per sample [ms]")
+    panels.legend_above(times, 2)
+    return drawn
 
 
 def _timed(data: xr.Dataset) -> list[str]:
-    return [
-        name for name in TIMED if name in data.controller.values and data.complete.sel(controller=name) == 1
-    ]
+    finished = data.controller.values[data.complete.values == 1]
+    return [name for name in TIMED if name in finished]
 
 
 def _caption(data: xr.Dataset) -> str:
@@ -64,22 +52,23 @@ def _caption(data: xr.Dataset) -> str:
     half = data.tuning_deadzone.sel(controller=BLOCKS)
     apart = float((np.abs(pair[0] - pair[1]) / half).max())
     medians = ", ".join(
-        f"{TIMED[name][0]} {two_digits(MILLISECONDS * float(data.solve_time.sel(controller=name).median()))} ms"
+        f"{TIMED[name]['label']} {two_digits(MILLISECONDS * float(data.solve_time.sel(controller=name).median()))} ms"
         for name in _timed(data)
     )
     return (
         f"With 16 blocks and with 200 single moves the rates are at most {apart:.2g} half widths of the deadzone apart. "
-        f"Median time of one step: {medians}.{compiled_note(data, _timed(data))}"
+        f"Median time of one step: {medians}.{time_note(data, _timed(data))}"
     )
 
 
-ENTRY = FigureEntry(
-    "blocking",
-    "what move blocking changes, and what it saves",
-    "unblocked",
-    "blocking",
-    draw,
-    (BLOCKS, SINGLE),
-    caption=_caption,
-    alt="Three plots over time: oil rate and choke position of two controllers, and time per sample of each controller.",
+ENTRIES = (
+    FigureEntry(
+        "blocking",
+        "what move blocking changes, and what it saves",
+        "unblocked",
+        "blocking",
+        draw,
+        _caption,
+        (BLOCKS, SINGLE),
+    ),
 )
