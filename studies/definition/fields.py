@@ -85,7 +85,9 @@ class Field:
             good = isinstance(value, str) and value in self.choices
             hint = near(value, self.choices) if not good else ""
         elif self.kind == "lengths":
-            good = isinstance(value, (list, tuple)) and all(type(v) is int and v >= 1 for v in value)
+            good = isinstance(value, (list, tuple)) and all(
+                isinstance(v, int) and v is not True and v >= 1 for v in value
+            )
             good = good and 1 <= sum(value) <= LONGEST
         elif isinstance(value, bool) or not isinstance(value, (int, float)):
             good = False

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
 import tomllib
 from importlib import resources
@@ -250,10 +249,8 @@ def settings(body: Any, path: str) -> dict[str, Any]:
             key = f"{prefix}{name}"
             where = f"{path}.{key}"
             below = [known for known in FIELDS if known.startswith(key + ".")]
-            if key == "disturbance":
-                out[key] = _disturbance(value, where)
-            elif key == "sensor_fault":
-                out[key] = _sensor_faults(value, where)
+            if key in _EVENTS:
+                out[key] = _events(value, key, where)
             elif key == "reference" and isinstance(value, dict):
                 out[key] = _convert(value, InlineReference, where)
                 out[key].build()
@@ -276,33 +273,26 @@ def settings(body: Any, path: str) -> dict[str, Any]:
     return out
 
 
-def _disturbance(value: Any, where: str) -> tuple[PressureStep, ...]:
+def _events(value: Any, table: str, where: str) -> tuple[Any, ...]:
+    """What ``[[base.disturbance]]`` or ``[[base.sensor_fault]]`` lists, each number checked by its key."""
+    kind, what = _EVENTS[table]
     if not isinstance(value, list):
-        raise InputError(where, value, f"steps of the reservoir pressure, each headed [[{where}]]")
-    steps = tuple(_convert(step, PressureStep, f"{where}[{i}]") for i, step in enumerate(value))
-    for i, step in enumerate(steps):
-        earliest = steps[i - 1].time if i else -math.inf
-        if not (math.isfinite(step.time) and step.time >= 0 and step.time > earliest):
-            expected = f"a time after the step before it, {earliest:g} s" if i else "a time of 0 s or more"
-            raise InputError(f"{where}[{i}].time", step.time, expected)
-        if not math.isfinite(step.offset):
-            raise InputError(
-                f"{where}[{i}].offset", step.offset, "a finite change of the reservoir pressure [bar]"
-            )
-    return steps
+        raise InputError(where, value, f"{what}, each headed [[{where}]]")
+    events = tuple(_convert(event, kind, f"{where}[{i}]") for i, event in enumerate(value))
+    for i, event in enumerate(events):
+        for name in ("time", "offset", "duration", "size"):
+            if (given := getattr(event, name, UNSET)) is not UNSET:
+                FIELDS[f"{table}.{name}"].check(f"{where}[{i}].{name}", given)
+        if table == "disturbance" and i and event.time <= events[i - 1].time:
+            expected = f"a time after the step before it, {events[i - 1].time:g} s"
+            raise InputError(f"{where}[{i}].time", event.time, expected)
+    return events
 
 
-def _sensor_faults(value: Any, where: str) -> tuple[FaultSection, ...]:
-    if not isinstance(value, list):
-        raise InputError(where, value, f"faults of sensors, each headed [[{where}]]")
-    faults = tuple(_convert(fault, FaultSection, f"{where}[{i}]") for i, fault in enumerate(value))
-    for i, fault in enumerate(faults):
-        for name in ("time", "duration", "size"):
-            if (given := getattr(fault, name)) is not UNSET:
-                FIELDS[f"sensor_fault.{name}"].check(f"{where}[{i}].{name}", given)
-    return faults
-
-
+_EVENTS: dict[str, tuple[Any, str]] = {
+    "disturbance": (PressureStep, "steps of the reservoir pressure"),
+    "sensor_fault": (FaultSection, "faults of sensors"),
+}
 _EXPECTED = {
     "axes": "a list of tables, each headed [[axes]]",
     "quick.axes": "a table of keys",

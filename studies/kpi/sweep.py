@@ -19,7 +19,8 @@ from jaxtyping import Array, Float
 from jaxmpc.controller.measurement import GOOD
 from jaxmpc.errors import InputError
 from jaxmpc.loop.trajectory import TrajectoryBatch
-from jaxmpc.problem.tuning import CV_FIELDS, MV_FIELDS, Tuning
+from jaxmpc.problem.tuning import FIELDS as TUNING
+from jaxmpc.problem.tuning import Tuning
 from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES
 from jaxmpc.status import OPTIMAL
 from studies.kpi import loop as kpi
@@ -364,14 +365,11 @@ def batch_kpis(batch: TrajectoryBatch, tunings: Tuning, window, *, tolerance=Non
     channels = channels_of(batch)
     runs = runs_of(batch, window)
     lanes, cvs, mvs = len(batch), len(batch.cv_names), len(batch.mv_names)
-    sizes: dict[str, tuple[int, ...]] = {field: (cvs,) for field in CV_FIELDS}
-    sizes |= {field: (mvs,) for field in (*MV_FIELDS, "oscillation_rows")}
+    sizes = {"cv": (cvs,), "mv": (mvs,), "": ()}
     each = Tuning(
         **{
-            field.name: _per_lane(
-                f"tunings.{field.name}", getattr(tunings, field.name), lanes, sizes.get(field.name, ())
-            )
-            for field in dataclasses.fields(Tuning)
+            key: _per_lane(f"tunings.{key}", getattr(tunings, key), lanes, sizes[field.of])
+            for key, field in TUNING.items()
         }
     )
     allowed = each.deadzone
