@@ -41,7 +41,14 @@ COLUMN = (
     "controller",
     "loop",
 )  # folders of jaxmpc; each uses those before
-GROUND = ("errors", "files", "status", "html", "programs")  # used by all of them, and using nothing else
+GROUND = (
+    "errors",
+    "decoding",
+    "files",
+    "status",
+    "html",
+    "programs",
+)  # used by all of them, and using nothing else
 BESIDE = {
     "process": {"model"},
     "steady": {"model", "problem", "relaxed", "integer"},  # `integer.highs` is the door of both
