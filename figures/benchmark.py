@@ -5,9 +5,7 @@ They read the JSON file of `jaxmpc bench --json`, or the same content in memory;
 
 from __future__ import annotations
 
-import contextlib
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,7 @@ DT_HOURS = 10.0 / 3600.0  # sampling interval of the thesis preset [h]
 MODES = ("moves", "inputs")
 
 
+@style.house_style
 def draw_benchmark(results: str | Path | dict[str, Any], out: str | Path) -> list[Path]:
     """Draw what the results have numbers for, as PNG and PDF.
 
@@ -38,12 +37,13 @@ def draw_benchmark(results: str | Path | dict[str, Any], out: str | Path) -> lis
     body = results if isinstance(results, dict) else _load(Path(results))
     series = body.get("series", {})
     paths: list[Path] = []
-    if any(name.startswith("run ") for name in series):
-        with time_per_sample(series) as drawn:
-            paths += style.save(drawn, out, RUN_NAME)
+    runs = [
+        (*name.split()[1:], np.array(s["solve_ms"])) for name, s in series.items() if name.startswith("run ")
+    ]
+    if runs:
+        paths += style.save(time_per_sample(runs), out, RUN_NAME)
     if any(name.startswith("batch ") for name in series):
-        with rate_over_batch(series) as drawn:
-            paths += style.save(drawn, out, BATCH_NAME)
+        paths += style.save(rate_over_batch(series), out, BATCH_NAME)
     return paths
 
 
@@ -56,39 +56,27 @@ def _load(path: Path) -> dict[str, Any]:
         ) from None
 
 
-@contextlib.contextmanager
-def time_per_sample(series: dict[str, Any]) -> Iterator[Figure]:
+def time_per_sample(runs: list[tuple[str, str, np.ndarray]]) -> Figure:
     """One panel per run: solve time of every sample, its median, and the value that 99 % stay below.
 
     Args:
-        series: of the results; ``run KIND MODE`` has ``solve_ms``.
+        runs: kind of the controller, blocking mode, and the times ``"sample"`` [ms].
     """
-    runs = [
-        (name.split()[1:], np.array(s["solve_ms"])) for name, s in series.items() if name.startswith("run ")
-    ]
-    with style.figure(len(runs), row_height=1.9, sharey=True) as (drawn, axes):
-        for ax, ((kind, mode), milliseconds) in zip(axes, runs, strict=True):
-            hours = np.arange(len(milliseconds)) * DT_HOURS
-            ax.plot(
-                hours, milliseconds, ".", markersize=1.6, color=style.colour(kind, "step"), rasterized=True
-            )
-            for value, line, word in (
-                (np.median(milliseconds), "-", "median"),
-                (np.percentile(milliseconds, 99), "--", "99 %"),
-            ):
-                ax.axhline(
-                    value,
-                    color=style.BLACK,
-                    linewidth=0.9,
-                    linestyle=line,
-                    label=style.printed(f"{word}: {two_digits(value)} ms"),
-                )
-            ax.set_yscale("log")
-            ax.set_ylabel("time per sample [ms]")
-            ax.set_title(f"{kind} MPC, {mode}", loc="left")
-            ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.1)
-        axes[-1].set_xlabel("time [h]")
-        yield drawn
+    drawn, axes = style.figure(len(runs), row_height=1.9, sharey=True)
+    for ax, (kind, mode, milliseconds) in zip(axes, runs, strict=True):
+        hours = np.arange(len(milliseconds)) * DT_HOURS
+        look: dict[str, Any] = {"markersize": 1.6, "color": style.colour(kind, "step"), "rasterized": True}
+        ax.plot(hours, milliseconds, ".", **look)
+        for percent, line, word in ((50, "-", "median"), (99, "--", "99 %")):
+            value = np.percentile(milliseconds, percent)
+            label = style.printed(f"{word}: {two_digits(value)} ms")
+            ax.axhline(value, color=style.BLACK, linewidth=0.9, linestyle=line, label=label)
+        ax.set_yscale("log")
+        ax.set_ylabel("time per sample [ms]")
+        ax.set_title(f"{kind} MPC, {mode}", loc="left")
+        ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.1)
+    axes[-1].set_xlabel("time [h]")
+    return drawn
 
 
 def two_digits(value: float) -> str:
@@ -96,42 +84,32 @@ def two_digits(value: float) -> str:
     return f"{value:,.0f}" if value >= 99.5 else f"{value:.2g}"
 
 
-@contextlib.contextmanager
-def rate_over_batch(series: dict[str, Any]) -> Iterator[Figure]:
+def rate_over_batch(series: dict[str, Any]) -> Figure:
     """Relaxed QPs per second over batch size, with and without a start, and the rate of the peer beside it.
 
     Args:
         series: of the results; ``batch MODE`` has ``batch``, ``warm``, ``cold`` and perhaps a peer's rate.
     """
     modes = [mode for mode in MODES if f"batch {mode}" in series]
-    with style.figure(len(modes), width=6.0, row_height=2.6, sharey=True) as (drawn, axes):
-        for ax, mode in zip(axes, modes, strict=True):
-            rates = series[f"batch {mode}"]
-            for name, rate in rates.items():
-                if name == "batch":
-                    continue
-                colour, line, label = _LINES.get(name, (style.BLACK, "--", f"{name}, one core"))
-                mark = "o" if name in _LINES else ""
-                ax.plot(
-                    rates["batch"][: len(rate)],
-                    rate,
-                    line,
-                    marker=mark,
-                    markersize=4,
-                    color=colour,
-                    label=label,
-                )
-            ax.set_xscale("log", base=2)
-            ax.set_yscale("log")
-            ax.set_xticks(rates["batch"], [f"{count:g}" for count in rates["batch"]])
-            ax.set_ylabel("rate [QP/s]")
-            ax.set_title(f"relaxed QP, {mode}", loc="left")
-        axes[0].legend(loc="best")
-        axes[-1].set_xlabel("batch size [problems]")
-        yield drawn
+    drawn, axes = style.figure(len(modes), width=6.0, row_height=2.6, sharey=True)
+    for ax, mode in zip(axes, modes, strict=True):
+        rates = dict(series[f"batch {mode}"])
+        sizes = rates.pop("batch")
+        for name, rate in rates.items():
+            peer = style.BLACK, "--", f"{name}, one core", ""
+            colour, line, label, mark = _LINES.get(name, peer)
+            ax.plot(sizes[: len(rate)], rate, line, marker=mark, markersize=4, color=colour, label=label)
+        ax.set_xscale("log", base=2)
+        ax.set_yscale("log")
+        ax.set_xticks(sizes, [f"{count:g}" for count in sizes])
+        ax.set_ylabel("rate [QP/s]")
+        ax.set_title(f"relaxed QP, {mode}", loc="left")
+    axes[0].legend(loc="best")
+    axes[-1].set_xlabel("batch size [problems]")
+    return drawn
 
 
 _LINES = {
-    "warm": (style.BLUE, "-", "jaxmpc, started one sample earlier"),
-    "cold": (style.ORANGE, "-", "jaxmpc, no start"),
+    "warm": (style.BLUE, "-", "jaxmpc, started one sample earlier", "o"),
+    "cold": (style.ORANGE, "-", "jaxmpc, no start", "o"),
 }

@@ -5,14 +5,14 @@ The page is one file that needs nothing else: pictures are embedded, and there i
 
 from __future__ import annotations
 
-import base64
 import html
 from collections.abc import Iterable
 from pathlib import Path
 
 import xarray as xr
 
-from figures.entry import FigureEntry
+from figures import style
+from figures.figure import FigureEntry
 from figures.produce import study_folder
 from figures.registry import FIGURES, check_ids
 from jaxmpc.errors import InputError
@@ -85,11 +85,10 @@ def _section(entry: FigureEntry, caption: str, picture: bytes, data: xr.Dataset 
     study = "none: computed from the problem itself"
     if data is not None:
         study = f"{data.attrs.get('study', entry.study)} ({data.attrs.get('title', '')})"
-    source = base64.b64encode(picture).decode()
     return f"""<section id="figure-{html.escape(entry.id)}">
 <h2>{html.escape(heading(entry))}</h2>
 <figure>
-<img alt="{html.escape(entry.alt)}" src="data:image/png;base64,{source}">
+{style.image(picture, entry.alt)}
 <figcaption>{html.escape(caption)}</figcaption>
 </figure>
 <dl>

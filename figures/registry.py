@@ -1,4 +1,7 @@
-"""Every figure by its id: which study it reads and which function draws it; the entries stand in their own modules."""
+"""Every figure by its id, and drawing them from stored results; the entries stand in the modules that draw them.
+
+The command line (`jaxmpc figures`, `jaxmpc study run` of a comparison), `figures.produce` and `figures.gallery` call it.
+"""
 
 from __future__ import annotations
 
@@ -8,21 +11,34 @@ from pathlib import Path
 import xarray as xr
 
 from figures import style
-from figures.entry import FigureEntry
-from figures.thesis import extensions, scenario_entries, thesis_entries, unblocked
+from figures.figure import FigureEntry
+from figures.thesis import (
+    coefficients,
+    events,
+    gain_scheduling,
+    integer_example,
+    mean_move,
+    open_loop,
+    plans,
+    runs,
+    soft,
+    solve_time,
+    summary,
+    time_limit,
+    unblocked,
+)
 from jaxmpc.errors import InputError
 from studies.kpi.evaluate import completed
 from studies.store.comparison import open_results
 
-
-def _order(entry: FigureEntry) -> tuple[bool, int]:
-    return not entry.id.isdigit(), int(entry.id) if entry.id.isdigit() else 0
-
+_NUMBERED = (integer_example, coefficients, soft, runs, plans, open_loop, events, solve_time)
+_NAMED = (summary, unblocked, gain_scheduling, mean_move, time_limit)
 
 FIGURES: dict[str, FigureEntry] = {
     entry.id: entry
-    for entry in sorted(
-        [*thesis_entries.ENTRIES, *scenario_entries.ENTRIES, unblocked.ENTRY, *extensions.ENTRIES], key=_order
+    for entry in (
+        *sorted((entry for module in _NUMBERED for entry in module.ENTRIES), key=lambda entry: int(entry.id)),
+        *(entry for module in _NAMED for entry in module.ENTRIES),
     )
 }
 
@@ -61,35 +77,42 @@ def draw(ids: Iterable[str], results: str | Path | xr.Dataset | None, out: str |
             anything is drawn.
     """
     ids = list(ids)
-    ids = check_ids(ids) if ids else []  # a study may have no figures
-    studies = list(dict.fromkeys(FIGURES[id].study for id in ids if FIGURES[id].study is not None))
+    entries = [FIGURES[id] for id in (check_ids(ids) if ids else [])]  # a study may have no figures
+    studies = list(dict.fromkeys(entry.study for entry in entries if entry.study is not None))
     if len(studies) > 1:
-        raise InputError("figure", ids, f"figures of one study, not of {', '.join(map(str, studies))}")
-    if studies and results is None:
-        raise InputError("results", None, f"results of the study {studies[0]}")
+        raise InputError("figure", ids, f"figures of one study, not of {', '.join(studies)}")
     data = None
     if studies:
-        data = results if isinstance(results, xr.Dataset) else open_results(results)  # type: ignore[arg-type]
-        data = data.load()
-        _check_finished(ids, data)
-    paths = []
-    for id in ids:
-        with FIGURES[id].draw(data) as drawn:
-            paths += style.save(drawn, out, FIGURES[id].name)
-    return paths
+        if results is None:
+            raise InputError("results", None, f"results of the study {studies[0]}")
+        data = (results if isinstance(results, xr.Dataset) else open_results(results)).load()
+        _check_finished(entries, data)
+    return [path for entry in entries for path in style.save(entry.draw(data), out, entry.name)]
 
 
-def _check_finished(ids: list[str], data: xr.Dataset) -> None:
-    finished = (
-        {str(name) for name in completed(data).controller.values}
-        if any(FIGURES[i].needs for i in ids)
-        else set()
+def draw_study(folder: str | Path, study: str) -> list[Path]:
+    """Draw every figure of a study into its ``figures`` folder.
+
+    Args:
+        folder: of the study.
+        study: a key of `studies.thesis.catalogue.STUDIES`.
+
+    Returns:
+        The files written.
+    """
+    return draw(
+        [id for id, entry in FIGURES.items() if entry.study == study], folder, Path(folder) / "figures"
     )
-    for id in ids:
-        missing = [name for name in FIGURES[id].needs if name not in finished]
+
+
+def _check_finished(entries: list[FigureEntry], data: xr.Dataset) -> None:
+    needed = any(entry.needs for entry in entries)
+    finished = set(map(str, completed(data).controller.values)) if needed else set()
+    for entry in entries:
+        missing = [name for name in entry.needs if name not in finished]
         if missing:
             raise InputError(
-                f"figure {id}",
+                f"figure {entry.id}",
                 ", ".join(missing),
                 "finished runs in the results",
                 "Run the study again to finish them",

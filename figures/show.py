@@ -5,23 +5,20 @@ What is drawn is recognised by its type. The axes that come back show themselves
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from figures import panels, style
+from figures import closed_loop, panels, style
 from figures.explore import is_comparison
 from figures.sweep import wear
 from figures.sweep.data import load
-from figures.sweep.draw import run_results
+from figures.thesis.soft import cost
 from jaxmpc.errors import InputError
 from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.problem.tuning import Tuning
@@ -38,9 +35,10 @@ class Panels(np.ndarray):
         return np.asarray(self).flat[0].figure
 
     def _repr_png_(self) -> bytes:
-        return _png(self.figure)
+        return style.png(self.figure, dpi=110)
 
 
+@style.house_style
 def plot(
     thing: Any,
     *,
@@ -62,19 +60,15 @@ def plot(
     Raises:
         InputError: for anything else, or a tuning of many scenarios.
     """
-    with plt.rc_context(style.RC):
-        if isinstance(thing, Trajectory):
-            return _trajectory(thing, tuning)
-        if isinstance(thing, str | Path | xr.Dataset):
-            return _study(thing)
-        draw = _DRAW.get(type(thing).__name__)  # figures import nothing that predicts or solves
-        if draw is None:
-            raise InputError(
-                "thing",
-                type(thing).__name__,
-                f"{', '.join(_DRAW)}, Trajectory, the path of a study store or an opened one",
-            )
-        return draw(thing, structure)
+    if isinstance(thing, Trajectory):
+        return _trajectory(thing, tuning)
+    if isinstance(thing, str | Path | xr.Dataset):
+        return _study(thing)
+    draw = _DRAW.get(type(thing).__name__)  # figures import nothing that predicts or solves
+    if draw is None:
+        expected = f"{', '.join(_DRAW)}, Trajectory, the path of a study store or an opened one"
+        raise InputError("thing", type(thing).__name__, expected)
+    return draw(thing, structure)
 
 
 def pareto(study: str | Path | xr.Dataset, x: str = "choke_travel", **options: Any) -> Axes:
@@ -97,40 +91,34 @@ def _model(model: Any, _: Any) -> Panels:
         raise InputError("model.coefficients", f"shape {list(steps.shape)}", "those of one model")
     axes = _axes(len(model.cv_names), len(model.mv_names), sharex=True)
     t = model.dt * np.arange(model.samples + 1)
-    for c, cv in enumerate(model.cv_names):
-        for m, mv in enumerate(model.mv_names):
-            ax = axes[c, m]
-            ax.axhline(0, color=style.BLACK, linewidth=0.6)
-            ax.plot(t, np.append(0.0, steps[c, m]), color=style.BLUE)
-            per = f"{_of(model.cv_units, c)} per {_of(model.mv_units, m)}"
-            ax.set_ylabel(f"{style.NAMES.get(cv, cv)} [{per}]")
-            if c == 0:
-                ax.set_title(f"unit step of {style.NAMES.get(mv, mv)}")
+    for (c, m), ax in np.ndenumerate(np.asarray(axes)):
+        ax.axhline(0, color=style.BLACK, linewidth=0.6)
+        ax.plot(t, np.append(0.0, steps[c, m]), color=style.BLUE)
+        per = f"{_unit(model, 'cv', c, 'unit')} per {_unit(model, 'mv', m, 'unit')}"
+        ax.set_ylabel(f"{_name(model, 'cv', c)} [{per}]")
+        if c == 0:
+            ax.set_title(f"unit step of {_name(model, 'mv', m)}")
     for ax in axes[-1]:
         ax.set_xlabel("time after the step [s]")
     return axes
 
 
 def _tuning(tuning: Tuning, structure: Any) -> Panels:
-    weight, square, linear, zone = (
-        np.asarray(getattr(tuning, name))
-        for name in ("cv_weight", "soft_quadratic", "soft_linear", "deadzone")
-    )
-    if weight.ndim != 1:
-        raise InputError("tuning", f"shape {list(weight.shape)}", "the tuning of one controller")
-    axes = _axes(1, len(weight))
-    for c, ax in enumerate(axes[0]):
-        soft = square[c] + linear[c] > 0
-        reach = 2.5 * zone[c] if soft and zone[c] > 0 else 1.0
-        e = np.linspace(-reach, reach, 401)
-        beyond = np.maximum(np.abs(e) - zone[c], 0.0)
-        if soft and zone[c] > 0:
-            ax.axvspan(-zone[c], zone[c], color=style.BAND, linewidth=0, label=f"deadzone ±{zone[c]:g}")
-        cost = weight[c] * e**2
-        ax.plot(e, cost, "--", color=style.BLACK, linewidth=1.0, label="without Soft MPC")
-        ax.plot(e, cost + square[c] * beyond**2 + linear[c] * beyond, color=style.BLUE, label="cost")
-        name = _name(structure, "cv", c)
-        ax.set_xlabel(f"deviation of the {name} [{_of(getattr(structure, 'cv_units', ()), c, 'CV unit')}]")
+    fields = ("cv_weight", "soft_quadratic", "soft_linear", "deadzone")
+    values = [np.asarray(getattr(tuning, name)) for name in fields]
+    if values[0].ndim != 1:
+        raise InputError("tuning", f"shape {list(values[0].shape)}", "the tuning of one controller")
+    axes = _axes(1, len(values[0]))
+    for c, (ax, (weight, square, linear, zone)) in enumerate(
+        zip(axes[0], zip(*values, strict=True), strict=True)
+    ):
+        banded = square + linear > 0 and zone > 0
+        e = np.linspace(-1.0, 1.0, 401) * (2.5 * zone if banded else 1.0)
+        if banded:
+            ax.axvspan(-zone, zone, color=style.BAND, linewidth=0, label=f"deadzone ±{zone:g}")
+        ax.plot(e, weight * e**2, "--", color=style.BLACK, linewidth=1.0, label="without Soft MPC")
+        ax.plot(e, cost(e, weight, square, linear, zone), color=style.BLUE, label="cost")
+        ax.set_xlabel(f"deviation of the {_name(structure, 'cv', c)} [{_unit(structure, 'cv', c)}]")
         ax.set_ylabel("cost of one sample [1]")
         ax.legend(loc="upper center")
     return axes
@@ -142,59 +130,47 @@ def _plan(plan: Any, structure: Any) -> Panels:
     cv, mv = np.asarray(plan.cv), np.asarray(plan.mv)
     axes = _axes(2, max(cv.shape[1], mv.shape[1]), sharex=True)
     dt = getattr(structure, "dt", None)
-    for row, values, kind in ((axes[0], cv, "cv"), (axes[1], mv, "mv")):
-        for i, ax in enumerate(row):
-            if i >= values.shape[1]:
-                ax.set_visible(False)
-                continue
-            t = np.arange(len(values) + (kind == "mv")) + (kind == "cv")
-            t = t * (dt or 1.0)
-            if kind == "cv":
-                ax.plot(t, values[:, i], color=style.PLAN)
-            else:
-                ax.step(t, np.append(values[:, i], values[-1, i]), where="post", color=style.PLAN)
-            unit = _of(getattr(structure, f"{kind}_units", ()), i, f"{kind.upper()} unit")
-            ax.set_ylabel(f"{_name(structure, kind, i)} [{unit}]")
+    for row, kind, values in ((axes[0], "cv", cv), (axes[1], "mv", np.vstack([mv, mv[-1:]]))):
+        t = (np.arange(len(values)) + (kind == "cv")) * (dt or 1.0)
+        for i, ax in enumerate(row[: values.shape[1]]):
+            ax.plot(t, values[:, i], color=style.PLAN, drawstyle="steps-post" if kind == "mv" else "default")
+            ax.set_ylabel(f"{_name(structure, kind, i)} [{_unit(structure, kind, i)}]")
             ax.set_xlabel("time from now [s]" if dt else "samples from now")
+        for ax in row[values.shape[1] :]:
+            ax.set_visible(False)
     return axes
 
 
-def _trajectory(run: Trajectory, tuning: Tuning | None) -> Panels:
-    zones = np.zeros(len(run.cv_names))
+def _trajectory(trajectory: Trajectory, tuning: Tuning | None) -> Panels:
+    zones = np.zeros(len(trajectory.cv_names))
     if tuning is not None:
         soft = np.asarray(tuning.soft_quadratic) + np.asarray(tuning.soft_linear) > 0
         zones = np.where(soft, np.asarray(tuning.deadzone), 0.0)
-    return _runs(run_results(run, zones, "continuous", "continuous"), ["run"])
+    return _runs(closed_loop.of_trajectory(trajectory, zones, "continuous", "continuous"))
 
 
 def _study(study: str | Path | xr.Dataset) -> Panels:
     comparison = "controller" in study.dims if isinstance(study, xr.Dataset) else is_comparison(study)
     if comparison:
-        data = completed(study if isinstance(study, xr.Dataset) else open_results(study)).load()
-        return _runs(data, [str(name) for name in data.controller.values])
+        return _runs(completed(study if isinstance(study, xr.Dataset) else open_results(study)).load())
     axes = _axes(1, 1, width=7.6, height=5.0)
     wear.pareto(study if isinstance(study, xr.Dataset) else load(study), axes=axes[0, 0])
     return axes
 
 
-def _runs(data: xr.Dataset, controllers: Sequence[str]) -> Panels:
-    """CVs with setpoint, then MVs; every controller in its colour."""
-    cvs, mvs = panels.cv_names(data), [str(name) for name in data.mv.values]
-    axes = _axes(len(cvs) + len(mvs), 1, width=7.6, height=1.7, sharex=True)
+def _runs(data: xr.Dataset) -> Panels:
+    """CVs with setpoint, then MVs; several controllers each in its colour."""
+    channels = [*panels.cv_names(data), *panels.mv_names(data)]
+    axes = _axes(len(channels), 1, width=7.6, height=1.7, sharex=True)
+    if data.sizes["controller"] == 1:
+        closed_loop.tracking(axes[:, 0], data, str(data.controller.values[0]))
+        return axes
     seconds = panels.time_axis(axes[-1, 0], *panels.span(data))
-    for name in controllers:
-        label = str(data.label.sel(controller=name).item()) if "label" in data.coords else name
-        for ax, cv in zip(axes[:, 0], cvs, strict=False):
-            if len(controllers) == 1:
-                panels.controlled(ax, data, name, cv, seconds)
-            else:
-                panels.measured(ax, data, name, cv, seconds, label)
-        for ax, mv in zip(axes[len(cvs) :, 0], mvs, strict=True):
-            panels.manipulated(ax, data, name, mv, seconds, label=label, legend=False)
-    if len(controllers) > 1:
-        for ax, cv in zip(axes[:, 0], cvs, strict=False):
-            panels.setpoint(ax, data, cv, seconds)
-        panels.legend_above(axes[0, 0])
+    labels = data.label if "label" in data.coords else data.controller
+    curves = {str(name): (str(labels.sel(controller=name).item()), None) for name in data.controller.values}
+    for ax, channel in zip(axes[:, 0], channels, strict=True):
+        panels.compared(ax, data, channel, curves, seconds)
+    panels.legend_above(axes[0, 0])
     return axes
 
 
@@ -205,26 +181,18 @@ _DRAW: dict[str, Callable[[Any, Any], Panels]] = {
 }
 
 
-def _axes(rows: int, columns: int, width: float = 0.0, height: float = 0.0, **options: Any) -> Panels:
-    """Empty panels of a figure that pyplot does not know; sizes in inches, of the figure and of a row."""
-    size = (width or max(4.0 * columns, 5.0), (height or 2.4) * rows + 0.4)
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure.subplots(rows, columns, squeeze=False, **options).view(Panels)
+def _axes(rows: int, columns: int, width: float = 0.0, height: float = 2.4, **options: Any) -> Panels:
+    """Empty panels; sizes in inches, of the figure and of a row."""
+    width = width or max(4.0 * columns, 5.0)
+    return style.grid(rows, columns, width, height * rows + 0.4, **options)[1].view(Panels)
 
 
-def _png(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    with plt.rc_context(style.RC):
-        figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
+def _unit(known: Any, kind: str, k: int, unknown: str = "") -> str:
+    """Unit of a CV or MV of a model or structure."""
+    units: Sequence[str] = getattr(known, f"{kind}_units", ())
+    return style.unit(units[k]) if k < len(units) and units[k] else unknown or f"{kind.upper()} unit"
 
 
-def _of(units: Sequence[str], k: int, unknown: str = "unit") -> str:
-    return style.unit(units[k]) if k < len(units) and units[k] else unknown
-
-
-def _name(structure: Any, kind: str, k: int) -> str:
-    names = getattr(structure, f"{kind}_names", ())
-    name = str(names[k]) if k < len(names) else f"{kind.upper()} {k + 1}"
-    return style.NAMES.get(name, name)
+def _name(known: Any, kind: str, k: int) -> str:
+    names = getattr(known, f"{kind}_names", ())
+    return style.name_of(str(names[k])) if k < len(names) else f"{kind.upper()} {k + 1}"

@@ -6,22 +6,17 @@ written as PNG and PDF, each file in one go.
 
 from __future__ import annotations
 
-import contextlib
+import base64
+import html
 import io
-import os
-import sys
-from collections.abc import Iterator
+import re
 from pathlib import Path
 from typing import Any
 
 import matplotlib
-
-if "matplotlib.pyplot" not in sys.modules and not os.environ.get("MPLBACKEND"):
-    matplotlib.use("Agg")  # needs no display; notebooks and scripts that chose a backend keep theirs
-
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from jaxmpc.files import write_atomically
@@ -49,7 +44,6 @@ VERDICT_COLOURS = {
 }
 
 NAMES = {"gas_rate": "gas rate", "oil_rate": "oil rate", "choke": "choke", "gas_lift": "gas lift"}
-UNITS = {"m3/h": "m³/h"}
 
 RC: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -74,38 +68,33 @@ RC: dict[Any, Any] = {
 }
 
 
-@contextlib.contextmanager
-def figure(
-    rows: int, width: float = 7.6, row_height: float = 2.2, **options
-) -> Iterator[tuple[Figure, list[Axes]]]:
-    """A figure of stacked panels in the house style; closed at the end.
+house_style = matplotlib.rc_context(RC)  # a decorator of what draws or writes
+
+
+def figure(rows: int, width: float = 7.6, row_height: float = 2.2, **options) -> tuple[Figure, list[Axes]]:
+    """A figure of stacked panels that share their horizontal axis.
 
     Args:
         rows: number of panels.
         width: of the figure [inch].
         row_height: of one panel [inch].
-        **options: for `matplotlib.pyplot.subplots`.
+        **options: for `matplotlib.figure.Figure.subplots`.
     """
-    with grid(rows, 1, width, row_height, **options) as (drawn, axes):
-        yield drawn, list(axes[:, 0])
+    drawn, axes = grid(rows, 1, width, row_height * rows + 0.5, **{"sharex": True, **options})
+    return drawn, list(axes[:, 0])
 
 
-@contextlib.contextmanager
-def grid(
-    rows: int, columns: int, width: float = 9.6, row_height: float = 2.0, **options
-) -> Iterator[tuple[Figure, np.ndarray]]:
-    """A figure of panels in rows and columns, axes ``"row column"``; arguments of `figure`."""
-    with plt.rc_context(RC):
-        options = {"sharex": True, **options}
-        drawn, axes = plt.subplots(
-            rows, columns, figsize=(width, row_height * rows + 0.5), squeeze=False, **options
-        )
-        try:
-            yield drawn, axes
-        finally:
-            plt.close(drawn)
+def grid(rows: int, columns: int, width: float, height: float, **options) -> tuple[Figure, np.ndarray]:
+    """A figure of panels in rows and columns, axes ``"row column"``; sizes of the figure [inch].
+
+    Pyplot does not know it: it needs no display, and nothing has to be closed.
+    """
+    drawn = Figure(figsize=(width, height))
+    FigureCanvasAgg(drawn)
+    return drawn, drawn.subplots(rows, columns, squeeze=False, **options)
 
 
+@house_style
 def save(drawn: Figure, out: str | Path, name: str) -> list[Path]:
     """Write ``name.png`` and ``name.pdf`` into a folder; equal figures give equal files.
 
@@ -121,23 +110,45 @@ def save(drawn: Figure, out: str | Path, name: str) -> list[Path]:
     return paths
 
 
+@house_style
+def png(drawn: Figure, dpi: float = 150) -> bytes:
+    """A figure as PNG."""
+    buffer = io.BytesIO()
+    drawn.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def image(source: bytes, words: str, look: str = "") -> str:
+    """A PNG as HTML that needs no further file; `words` say what it shows to readers who do not see it."""
+    content = base64.b64encode(source).decode()
+    return f'<img alt="{html.escape(words)}"{look} src="data:image/png;base64,{content}">'
+
+
 def colour(kind: str, actuator: str, position: int = 0) -> str:
     """Colour of a controller; `position` tells further kinds apart."""
     return CONTROLLER_COLOURS.get((kind, actuator), SPARE_COLOURS[position % len(SPARE_COLOURS)])
 
 
 def unit(text: str) -> str:
-    """A unit as it is printed."""
-    return UNITS.get(text, text)
+    """A unit as it is printed, powers included."""
+    return re.sub(r"m3\b", "m³", text).replace("^2", "²")
 
 
 def printed(text: str) -> str:
     """A sentence with its units as they are printed."""
-    for plain, shown in UNITS.items():
-        text = text.replace(plain, shown)
-    return text.replace(" %", "\N{NO-BREAK SPACE}%")
+    return text.replace("m3/h", "m³/h").replace(" %", "\N{NO-BREAK SPACE}%")
 
 
-def label(name: str, unit_text: str) -> str:
-    """An axis label with its unit: ``gas rate [m³/h]``."""
-    return f"{NAMES.get(name, name.replace('_', ' '))} [{unit(unit_text)}]"
+def name_of(channel: str) -> str:
+    """A CV or MV in words."""
+    return NAMES.get(channel, channel.replace("_", " "))
+
+
+def label(channel: str, unit_text: str, what: str = "") -> str:
+    """An axis label with its unit: ``gas rate [m³/h]``, ``choke move [%]``."""
+    return f"{name_of(channel)}{what} [{unit(unit_text)}]"
+
+
+def signed(value: float, form: str = "g") -> str:
+    """A number with its sign, format `form`."""
+    return f"{value:+{form}}".replace("-", "−")

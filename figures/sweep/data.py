@@ -6,8 +6,8 @@ A study is recognised by its columns and not by its name, so that any study with
 from __future__ import annotations
 
 import dataclasses
-import re
 import warnings
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -67,13 +67,13 @@ class SweepAxis:
     @property
     def title(self) -> str:
         """For an axis or a colour bar."""
-        return f"{self.label} [{unit(self.unit)}]" if self.numeric else self.label
+        return f"{self.label} [{style.unit(self.unit)}]" if self.numeric else self.label
 
     def text(self, value) -> str:
         """One of its values in words, with the unit."""
         if not self.numeric:
             return str(value)
-        return f"{value:g}" + (f" {unit(self.unit)}" if self.unit != "1" else "")
+        return f"{value:g}" + (f" {style.unit(self.unit)}" if self.unit != "1" else "")
 
     @property
     def scale(self) -> str:
@@ -89,11 +89,6 @@ def spacing(values: np.ndarray) -> float:
     """Largest over smallest distance of increasing values."""
     steps = np.diff(values)
     return float(steps.max() / steps.min()) if len(steps) else 1.0
-
-
-def unit(text: str) -> str:
-    """A unit as it is printed, powers included."""
-    return re.sub(r"m3\b", "m³", text).replace("^2", "²")
 
 
 def load(store: str | Path) -> xr.Dataset:
@@ -131,6 +126,23 @@ def deviation(data: xr.Dataset, cv: str | None = None, name: str = "mean_absolut
         return values.sel(cv=cv)
     scale = xr.DataArray([THESIS_DEADZONE[str(name)] for name in data.cv.values], dims="cv")
     return (values / scale).mean("cv", skipna=False)
+
+
+def quantities(data: xr.Dataset, cvs: Sequence) -> list[tuple[str, np.ndarray]]:
+    """What a tuning trades: choke travel and the mean deviation of each CV, with the titles of their axes."""
+    out = [("choke travel [%]", figure_of(data, "choke_travel").values)]
+    for cv in map(str, cvs):
+        units = style.unit(str(data.cv_unit.sel(cv=cv).item()))
+        out.append((f"mean deviation, {style.name_of(cv)} [{units}]", deviation(data, cv).values))
+    return out
+
+
+def rows_by(*keys: Iterable) -> dict[tuple, np.ndarray]:
+    """Positions of the scenarios with equal values of all keys ``"scenario"``, in the order in which they appear."""
+    found: dict[tuple, list[int]] = {}
+    for row, key in enumerate(zip(*keys, strict=True)):
+        found.setdefault(key, []).append(row)
+    return {key: np.array(rows) for key, rows in found.items()}
 
 
 def columns(data: xr.Dataset) -> dict[str, np.ndarray]:
@@ -227,15 +239,13 @@ def thesis_tuning(data: xr.Dataset) -> np.ndarray:
 
 def controller_of(data: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
     """Kind of the controller and kind of the choke actuator of each scenario."""
-    out = []
-    for key in CONTROLLER:
+
+    def of(key: str) -> np.ndarray:
         if key in data.coords:
-            out.append(data[key].values)
-        else:
-            out.append(
-                np.full(data.sizes["scenario"], setting(data, key) or FIELDS[key].default, dtype=object)
-            )
-    return out[0], out[1]
+            return data[key].values
+        return np.full(data.sizes["scenario"], setting(data, key) or FIELDS[key].default, dtype=object)
+
+    return of(CONTROLLER[0]), of(CONTROLLER[1])
 
 
 def controllers(data: xr.Dataset) -> np.ndarray:
@@ -265,15 +275,12 @@ class Variant:
 def variants(data: xr.Dataset, axes: list[SweepAxis]) -> list[Variant]:
     """The scenarios by everything that a controller or an operator chooses."""
     chosen = [axis for axis in axes if not axis.uncertain]
-    keys = list(zip(*(axis.values.tolist() for axis in chosen), strict=True)) or [()] * data.sizes["scenario"]
+    everything = {(): np.arange(data.sizes["scenario"])}
     kind, actuator = controller_of(data)
     out: list[Variant] = []
-    for i, key in enumerate(dict.fromkeys(keys)):
-        rows = np.flatnonzero([other == key for other in keys])
+    for i, (key, rows) in enumerate((rows_by(*(a.values.tolist() for a in chosen)) or everything).items()):
         words = [
-            axis.text(value)
-            if axis.key in ("controller", "reference")
-            else f"{axis.label} {axis.text(value)}"
+            ("" if axis.key in ("controller", "reference") else f"{axis.label} ") + axis.text(value)
             for axis, value in zip(chosen, key, strict=True)
         ]
         colour = style.colour(str(kind[rows[0]]), str(actuator[rows[0]]), i)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
@@ -21,41 +20,38 @@ from figures.sweep.data import (
     controller_of,
     deviation,
     figure_of,
+    quantities,
+    rows_by,
     sweep_axes,
     thesis_tuning,
-    unit,
 )
 from figures.sweep.wear import MAP, linked_sentences
 
 LONGEST = 40  # values along an axis
 FILLED = 0.5  # of the cells, else the two axes are no grid
 NUMBERS = 130  # cells of a map that still have their number printed
+DARK = 0.62  # of the colour scale, beyond it numbers are dark
 
 
 def map_axes(data: xr.Dataset) -> tuple[SweepAxis, SweepAxis] | None:
     """The first two numeric axes that form a grid; None without."""
-    numeric = [
-        axis
-        for axis in sweep_axes(data)
-        if axis.numeric and axis.key != "seed" and len(axis.unique) <= LONGEST
-    ]
+    known = sweep_axes(data)
+    numeric = [a for a in known if a.numeric and a.key != "seed" and len(a.unique) <= LONGEST]
     for i, first in enumerate(numeric):
         for second in numeric[i + 1 :]:
-            cells = len(set(zip(first.values.tolist(), second.values.tolist(), strict=True)))
-            if cells >= FILLED * len(first.unique) * len(second.unique) and cells > len(first.unique):
+            count = len(set(zip(first.values.tolist(), second.values.tolist(), strict=True)))
+            if count >= FILLED * len(first.unique) * len(second.unique) and count > len(first.unique):
                 return first, second
     return None
 
 
 def controller_parts(data: xr.Dataset) -> list[tuple[str, str, xr.Dataset]]:
     """Label, short name for files ("" if there is one controller only), and the scenarios of each controller."""
-    kind, actuator = controller_of(data)
-    both = list(zip(kind.tolist(), actuator.tolist(), strict=True))
+    parts = rows_by(*controller_of(data))
     out = []
-    for one in dict.fromkeys(both):
-        rows = np.flatnonzero([other == one for other in both])
-        name = f"_{one[0]}_{one[1]}_choke".replace("-", "_") if len(set(both)) > 1 else ""
-        out.append((f"{one[0]} MPC, {one[1]} choke", name, data.isel(scenario=rows)))
+    for (kind, actuator), rows in parts.items():
+        name = f"_{kind}_{actuator}_choke".replace("-", "_") if len(parts) > 1 else ""
+        out.append((f"{kind} MPC, {actuator} choke", name, data.isel(scenario=rows)))
     return out
 
 
@@ -67,18 +63,11 @@ def cells(values: np.ndarray, at: list[tuple[np.ndarray, list]]) -> np.ndarray:
         at: rows, then columns: where each scenario is, and the distinct places.
     """
     (rows, row_places), (columns, column_places) = at
-    out = np.full((len(row_places), len(column_places)), np.nan)
-    for i, row in enumerate(row_places):
-        for j, column in enumerate(column_places):
-            inside = values[(rows == row) & (columns == column)]
-            inside = inside[~np.isnan(inside)]
-            if len(inside):
-                out[i, j] = np.median(inside)
-    return out
+    medians = pd.Series(values).groupby([rows, columns]).median().unstack()
+    return medians.reindex(index=row_places, columns=column_places).to_numpy(dtype=float)
 
 
-@contextlib.contextmanager
-def draw(data: xr.Dataset, axes: tuple[SweepAxis, SweepAxis], label: str = "") -> Iterator[Figure]:
+def draw(data: xr.Dataset, axes: tuple[SweepAxis, SweepAxis], label: str = "") -> Figure:
     """Choke travel, reversals, and the mean deviation of each CV over two axes.
 
     Args:
@@ -87,46 +76,42 @@ def draw(data: xr.Dataset, axes: tuple[SweepAxis, SweepAxis], label: str = "") -
         label: of the controller.
     """
     across, up = axes
-    quantities = [
-        ("choke travel [%]", figure_of(data, "choke_travel").values),
-        ("choke reversals [1]", figure_of(data, "choke_reversals").values),
-    ]
-    for cv in data.cv.values:
-        name = style.NAMES.get(str(cv), str(cv))
-        title = f"mean deviation, {name} [{unit(str(data.cv_unit.sel(cv=cv).item()))}]"
-        quantities.append((title, deviation(data, str(cv)).values))
-    mark = thesis_tuning(data)
-    rows = (len(quantities) + 1) // 2
-    with sheet.sheet(rows, 2, 9.0, 3.05 * rows + 0.7) as (drawn, panels):
-        for i, (title, values) in enumerate(quantities):
-            ax = panels[i // 2, i % 2]
-            table = cells(values, [(up.values, up.unique), (across.values, across.unique)])
-            x, y = _place(ax, across, "x"), _place(ax, up, "y")
-            mesh = heat(ax, table, edges(x, across.scale), edges(y, up.scale), centres=(x, y))
-            sheet.colour_bar(mesh, ax, pad=0.02, aspect=25)
-            ax.set_title(title, loc="left")
-            if i // 2 == rows - 1:
-                ax.set_xlabel(across.title)
-            if i % 2 == 0:
-                ax.set_ylabel(up.title)
-            if mark.any():
-                at = np.flatnonzero(mark)[0]
-                place = across.unique.index(across.values[at]), up.unique.index(up.values[at])
-                outline(ax, edges(x, across.scale), edges(y, up.scale), place)
-        for spare in panels.ravel()[len(quantities) :]:
-            spare.set_visible(False)
-        framed = "Framed: the tuning of the thesis." if mark.any() else ""
-        sheet.write(drawn, data, [_caption(data, axes, label), framed, *linked_sentences(data)])
-        yield drawn
+    shown = quantities(data, data.cv.values)
+    shown.insert(1, ("choke reversals [1]", figure_of(data, "choke_reversals").values))
+    mark = np.flatnonzero(thesis_tuning(data))
+    rows = (len(shown) + 1) // 2
+    drawn, grid = style.grid(rows, 2, 9.0, 3.05 * rows + 0.7)
+    for i, (ax, (title, values)) in enumerate(zip(grid.flat, shown, strict=False)):
+        table = cells(values, [(up.values, up.unique), (across.values, across.unique)])
+        x, y = _place(ax, across, "x"), _place(ax, up, "y")
+        borders = edges(x, across.scale), edges(y, up.scale)
+        sheet.colour_bar(heat(ax, table, borders, (x, y)), ax, pad=0.02, aspect=25)
+        ax.set_title(title, loc="left")
+        if i // 2 == rows - 1:
+            ax.set_xlabel(across.title)
+        if i % 2 == 0:
+            ax.set_ylabel(up.title)
+        if len(mark):
+            outline(ax, *borders, [axis.unique.index(axis.values[mark[0]]) for axis in axes])
+    for spare in grid.flat[len(shown) :]:
+        spare.set_visible(False)
+    framed = "Framed: the tuning of the thesis." if len(mark) else ""
+    sheet.write(drawn, data, [_caption(data, axes, label), framed, *linked_sentences(data)])
+    return drawn
 
 
 def _caption(data: xr.Dataset, axes: tuple[SweepAxis, SweepAxis], label: str) -> str:
     """What the cells are a median of, and where distances are not to scale."""
-    further = [a.label for a in sweep_axes(data) if a.key not in {axis.key for axis in axes}]
-    median = f"median over {', '.join(further)}" if further else "one scenario per cell"
+    median = _median(data, {axis.key for axis in axes}) or "one scenario per cell"
     equal = [axis.label for axis in axes if axis.scale == "equal"]
     scale = f"; {' and '.join(equal)} at equal distances, not to scale" if equal else ""
-    return f"{label + ': ' + median if label else median.capitalize()}{scale}."
+    return f"{label + ': ' + median if label else median[0].upper() + median[1:]}{scale}."
+
+
+def _median(data: xr.Dataset, shown: set[str]) -> str:
+    """What else varies in a cell."""
+    further = [axis.label for axis in sweep_axes(data) if axis.key not in shown]
+    return f"median over {', '.join(further)}" if further else ""
 
 
 def _place(ax: Axes, axis: SweepAxis, which: str) -> np.ndarray:
@@ -154,35 +139,31 @@ def edges(places: np.ndarray, scale: str) -> np.ndarray:
 def heat(
     ax: Axes,
     table: np.ndarray,
-    x_edges: np.ndarray,
-    y_edges: np.ndarray,
-    *,
+    borders: tuple[np.ndarray, np.ndarray],
     centres: tuple[np.ndarray, np.ndarray],
     norm: Normalize | None = None,
-    numbers: bool | None = None,
     size: float | None = None,
 ) -> QuadMesh:
-    """One map; logarithmic colours for values of several magnitudes, numbers printed where they fit."""
-    finite = table[np.isfinite(table)]
-    norm = norm or colours(finite)
+    """One map; logarithmic colours for values of several magnitudes, numbers printed where they fit.
+
+    Args:
+        ax: to draw on.
+        table: ``"row column"``.
+        borders: of the columns and of the rows.
+        centres: of the columns and of the rows.
+        norm: colour scale; that of the values if not given.
+        size: of the numbers [pt].
+    """
+    norm = norm or colours(table)
     size = size or (8.0 if table.size <= 50 else 6.3)
-    mesh = ax.pcolormesh(x_edges, y_edges, np.ma.masked_invalid(table), cmap=MAP, norm=norm)
+    mesh = ax.pcolormesh(*borders, np.ma.masked_invalid(table), cmap=MAP, norm=norm)
     ax.set_facecolor("#F2F2F2")
     ax.grid(False)
-    if numbers if numbers is not None else table.size <= NUMBERS:
-        middle = 0.62
-        for i, j in zip(*np.nonzero(np.isfinite(table)), strict=True):
-            place, value = (float(centres[0][j]), float(centres[1][i])), float(table[i, j])
-            shade = style.BLACK if float(norm(value)) > middle else "white"
-            ax.text(
-                *place,
-                short(value, 3 if size > 7 else 2),
-                ha="center",
-                va="center",
-                fontsize=size,
-                color=shade,
-                clip_on=True,
-            )
+    look: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": size, "clip_on": True}
+    for i, j in np.argwhere(np.isfinite(table)) if table.size <= NUMBERS else ():
+        shade = style.BLACK if float(norm(table[i, j])) > DARK else "white"
+        text = short(float(table[i, j]), 3 if size > 7 else 2)
+        ax.text(float(centres[0][j]), float(centres[1][i]), text, color=shade, **look)
     return mesh
 
 
@@ -193,18 +174,18 @@ def short(value: float, digits: int) -> str:
     return f"{value:.0f}" if abs(value) >= 10**digits - 0.5 else f"{value:.{digits}g}"
 
 
-def outline(ax: Axes, x: np.ndarray, y: np.ndarray, cell: tuple[int, int]) -> None:
+def outline(ax: Axes, x: np.ndarray, y: np.ndarray, cell: list[int]) -> None:
     """Frame a cell, column and row given, dark on light and light on dark."""
     i, j = cell
+    size = x[i + 1] - x[i], y[j + 1] - y[j]
     for colour, width in (("white", 3.6), (style.BLACK, 1.6)):
-        size = x[i + 1] - x[i], y[j + 1] - y[j]
-        frame = Rectangle((x[i], y[j]), *size, edgecolor=colour, linewidth=width, fill=False, clip_on=False)
-        frame.set_zorder(5)
-        ax.add_patch(frame)
+        look: dict[str, Any] = {"edgecolor": colour, "linewidth": width, "fill": False, "clip_on": False}
+        ax.add_patch(Rectangle((x[i], y[j]), *size, zorder=5, **look))
 
 
-def colours(finite: np.ndarray) -> Normalize:
+def colours(values: np.ndarray) -> Normalize:
     """The colour scale of some values."""
+    finite = values[np.isfinite(values)]
     if not len(finite):
         return Normalize(0, 1)
     low, high = float(finite.min()), float(finite.max())
@@ -219,8 +200,7 @@ def is_mismatch(axes: list[SweepAxis]) -> bool:
     return "reference" in keys and bool(keys & {"model.choke", "model.lift"})
 
 
-@contextlib.contextmanager
-def mismatch(data: xr.Dataset) -> Iterator[Figure]:
+def mismatch(data: xr.Dataset) -> Figure:
     """Deviation and choke travel by working point of the model and operating region, a row of panels per controller.
 
     Args:
@@ -228,72 +208,48 @@ def mismatch(data: xr.Dataset) -> Iterator[Figure]:
     """
     parts = controller_parts(data)
     found = {axis.key: axis for axis in sweep_axes(data)}
-    regions = found["reference"].unique
     key = "model.choke" if "model.choke" in found else "model.lift"
-    points = found[key].unique
-    lifts = found["model.lift"].unique if key == "model.choke" and "model.lift" in found else [None]
-    values: tuple[tuple[str, Callable[[xr.Dataset], np.ndarray]], ...] = (
-        ("deviation / thesis deadzone, mean of the CVs [1]", lambda part: deviation(part).values),
-        ("choke travel [%]", lambda part: figure_of(part, "choke_travel").values),
-    )
-    steps = len(lifts)
+    regions, points = found["reference"].unique, found[key].unique
+    lifts = found["model.lift"].unique if key == "model.choke" and "model.lift" in found else []
+    steps = max(len(lifts), 1)  # rows of a region
+    titles = ("deviation / thesis deadzone, mean of the CVs [1]", "choke travel [%]")
     height = max(len(parts) * (0.21 * steps * len(regions) + 0.55), 2.0)
-    options = {"sharex": True, "sharey": True}
-    with sheet.sheet(len(parts), 2, 9.0, height + 1.5, **options) as (drawn, panels):
-        y = np.arange(steps * len(regions), dtype=float)
-        x = np.arange(len(points), dtype=float)
-        for column, (title, quantity) in enumerate(values):
-            norm = colours(_finite(quantity(data)))
-            mesh: Any = None
-            for ax, (label, _, part) in zip(panels[:, column], parts, strict=True):
-                where = [
-                    regions.index(region) * steps + (lifts.index(lift) if lifts != [None] else 0)
-                    for region, lift in zip(
-                        part.reference.values,
-                        part["model.lift"].values if lifts != [None] else [None] * part.sizes["scenario"],
-                        strict=True,
-                    )
-                ]
-                table = cells(quantity(part), [(np.array(where), y.tolist()), (part[key].values, points)])
-                mesh = heat(
-                    ax, table, edges(x, "equal"), edges(y, "equal"), centres=(x, y), norm=norm, size=6
-                )
-                for border in range(1, len(regions)):
-                    ax.axhline(border * steps - 0.5, color="white", linewidth=2.5)
-                ax.set_title(label if column == 0 else " ", loc="left", fontsize=9)
-                ax.set_xticks(x, [f"{v:g}" for v in points])
-                ax.tick_params(length=0)
-            panels[-1, column].set_xlabel(f"{found[key].label} [{unit(found[key].unit)}]")
-            sheet.colour_bar(mesh, panels[:, column], title, location="top", aspect=40, pad=0.02)
-        for ax in panels[:, 0]:
-            ax.set_yticks(y, [f"{lifts[int(k) % steps] or 0:g}" if lifts != [None] else "" for k in y])
-            for i, region in enumerate(regions):
-                middle = i * steps + (steps - 1) / 2
-                ax.annotate(
-                    str(region),
-                    (-0.13 if lifts != [None] else -0.02, middle),
-                    xycoords=("axes fraction", "data"),
-                    ha="right",
-                    va="center",
-                    fontsize=8.5,
-                )
-        holes = not np.isfinite(np.concatenate([quantity(data) for _, quantity in values])).all()
-        words = f"Rows: operating region{', in it the gas lift of the working point [m3/h]' * (steps > 1)}."
-        known = {"controller", "reference", key, "model.lift"}
-        further = [axis.label for axis in sweep_axes(data) if axis.key not in known]
-        median = f" Median over {', '.join(further)}." if further else ""
-        sheet.write(
-            drawn,
-            data,
-            [
-                words
-                + " One colour scale for all controllers." * (len(parts) > 1)
-                + median
-                + " Empty: no finite figure." * (holes or bool(data.attrs.get("missing")))
-            ],
-        )
-        yield drawn
+    drawn, grid = style.grid(len(parts), 2, 9.0, height + 1.5, sharex=True, sharey=True)
+    y, x = (np.arange(count, dtype=float) for count in (steps * len(regions), len(points)))
+    holes = bool(data.attrs.get("missing"))
+    for column, (title, quantity) in enumerate(zip(titles, (deviation, _travel), strict=True)):
+        norm = colours(quantity(data).values)
+        holes = holes or not np.isfinite(quantity(data).values).all()
+        mesh: Any = None
+        for ax, (label, _, part) in zip(grid[:, column], parts, strict=True):
+            where = steps * np.array([regions.index(region) for region in part.reference.values])
+            if lifts:
+                where = where + np.searchsorted(lifts, part["model.lift"].values)
+            table = cells(quantity(part).values, [(where, y.tolist()), (part[key].values, points)])
+            mesh = heat(ax, table, (edges(x, "equal"), edges(y, "equal")), (x, y), norm, size=6)
+            for border in range(1, len(regions)):
+                ax.axhline(border * steps - 0.5, color="white", linewidth=2.5)
+            ax.set_title(label if column == 0 else " ", loc="left", fontsize=9)
+            ax.set_xticks(x, [f"{v:g}" for v in points])
+            ax.tick_params(length=0)
+        grid[-1, column].set_xlabel(found[key].title)
+        sheet.colour_bar(mesh, grid[:, column], title, location="top", aspect=40, pad=0.02)
+    for ax in grid[:, 0]:
+        ax.set_yticks(y, [f"{lift:g}" for lift in lifts] * len(regions) if lifts else [""] * len(y))
+        for i, region in enumerate(regions):
+            place = (-0.13 if lifts else -0.02, i * steps + (steps - 1) / 2)
+            look: dict[str, Any] = {"ha": "right", "va": "center", "fontsize": 8.5}
+            ax.annotate(str(region), place, xycoords=("axes fraction", "data"), **look)
+    median = _median(data, {"controller", "reference", key, "model.lift"})
+    words = [
+        f"Rows: operating region{', in it the gas lift of the working point [m3/h]' * (steps > 1)}.",
+        "One colour scale for all controllers." * (len(parts) > 1),
+        f"M{median[1:]}." if median else "",
+        "Empty: no finite figure." * holes,
+    ]
+    sheet.write(drawn, data, [" ".join(filter(None, words))])
+    return drawn
 
 
-def _finite(values: np.ndarray) -> np.ndarray:
-    return values[np.isfinite(values)]
+def _travel(data: xr.Dataset) -> xr.DataArray:
+    return figure_of(data, "choke_travel")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -16,9 +14,9 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Bbox
 
-from figures import style
+from figures import panels, style
 from figures.sweep import sheet
-from figures.sweep.data import STRUCTURE, columns, figure_of, setting, thesis_setting
+from figures.sweep.data import STRUCTURE, columns, figure_of, rows_by, setting, thesis_setting
 from studies.definition.fields import as_text
 
 COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.ORANGE, style.PURPLE, style.SKY, style.GREY)
@@ -63,24 +61,19 @@ def blockings(data: xr.Dataset) -> list[Blocking]:
     """Every combination of mode, blocks and horizons in the study."""
     found = columns(data)
     keys = [key for key in STRUCTURE if key in found]
-    rows = list(zip(*(found[key].tolist() for key in keys), strict=True))
+    thesis = {key: thesis_setting(key) for key in STRUCTURE}
     out = []
-    for one in dict.fromkeys(rows):
+    for one, rows in rows_by(*(found[key].tolist() for key in keys)).items():
         given = dict(zip(keys, one, strict=True))
-        full: dict[str, Any] = {
-            key: given.get(key) or setting(data, key) or thesis_setting(key) for key in STRUCTURE
-        }
+        full: dict[str, Any] = {key: given.get(key) or setting(data, key) or thesis[key] for key in STRUCTURE}
         lengths = [int(v) for v in as_text(full["blocks"] if full["blocks"] is not None else "").split()]
-        blocks = len(lengths)
+        blocks, horizon = len(lengths), int(full["prediction_horizon"])
         if full["blocking"] == "none":
             blocks = int(full["control_horizon"] or 0) or sum(lengths)
-        same = all(as_text(full[key]) == as_text(thesis_setting(key)) for key in ("blocking", "blocks"))
-        same = same and full["prediction_horizon"] == thesis_setting("prediction_horizon")
-        inside = np.flatnonzero([row == one for row in rows])
-        horizon = int(full["prediction_horizon"])
-        out.append(
-            Blocking(str(full["blocking"]), blocks, horizon, blocks * data.sizes.get("mv", 2), inside, same)
-        )
+        same = all(as_text(full[key]) == as_text(thesis[key]) for key in ("blocking", "blocks"))
+        same = same and horizon == thesis["prediction_horizon"]
+        unknowns = blocks * data.sizes.get("mv", 2)
+        out.append(Blocking(str(full["blocking"]), blocks, horizon, unknowns, rows, same))
     return out
 
 
@@ -91,17 +84,15 @@ def regret(data: xr.Dataset, variants: list[Blocking]) -> tuple[np.ndarray, str]
     the reference run is missing.
     """
     cost = figure_of(data, "closed_loop_cost").values
-    found = {key: values for key, values in columns(data).items() if key not in STRUCTURE}
-    context = list(zip(*(values.tolist() for values in found.values()), strict=True)) or [()] * len(cost)
-    thesis = [variant for variant in variants if variant.thesis]
-    base: dict[tuple, float] = {}
-    for row in thesis[0].rows if thesis else range(len(cost)):
-        value = float(cost[row])
-        if not np.isnan(value):
-            base[context[row]] = value if thesis else min(value, base.get(context[row], np.inf))
-    against = np.array([base.get(key, np.nan) for key in context])
-    name = "the thesis blocking" if thesis else "the best blocking"
-    return 100 * (cost / against - 1), name
+    context = [values.tolist() for key, values in columns(data).items() if key not in STRUCTURE]
+    thesis = next((variant.rows for variant in variants if variant.thesis), None)
+    against = np.full(len(cost), np.nan)
+    for rows in rows_by(*context).values() if context else [np.arange(len(cost))]:
+        base = cost[rows if thesis is None else np.intersect1d(rows, thesis)]
+        base = base[~np.isnan(base)]
+        if len(base):
+            against[rows] = base.min() if thesis is None else base[-1]
+    return 100 * (cost / against - 1), "the best blocking" if thesis is None else "the thesis blocking"
 
 
 def quartiles(values: np.ndarray) -> np.ndarray:
@@ -110,8 +101,7 @@ def quartiles(values: np.ndarray) -> np.ndarray:
     return np.percentile(values, [25, 50, 75]) if len(values) else np.full(3, np.nan)
 
 
-@contextlib.contextmanager
-def draw(data: xr.Dataset) -> Iterator[Figure]:
+def draw(data: xr.Dataset) -> Figure:
     """Regret over median and 99th percentile of the solve time, and over the number of unknowns.
 
     Args:
@@ -119,80 +109,76 @@ def draw(data: xr.Dataset) -> Iterator[Figure]:
     """
     variants = blockings(data)
     lost, reference = regret(data, variants)
-    runs = max(len(variant.rows) for variant in variants)
     kinds = list(dict.fromkeys(variant.label for variant in variants))
-    panels_of = (
-        ("median time of a controller step [ms]", 1e3 * figure_of(data, "solve_time_median").values),
-        ("99th percentile of that time [ms]", 1e3 * figure_of(data, "solve_time_p99").values),
-        ("moves to decide at each sample [1]", None),
+    colours = {kind: COLOURS[i % len(COLOURS)] for i, kind in enumerate(kinds)}
+    unknowns = np.full(len(lost), np.nan)
+    for variant in variants:
+        unknowns[variant.rows] = variant.unknowns
+    drawn, ((first, second, third),) = style.grid(1, 3, 10.4, 4.6, sharey=True)
+    to_place = []
+    for ax, values, title in (
+        (first, 1e3 * figure_of(data, "solve_time_median").values, "median time of a controller step [ms]"),
+        (second, 1e3 * figure_of(data, "solve_time_p99").values, "99th percentile of that time [ms]"),
+        (third, unknowns, "moves to decide at each sample [1]"),
+    ):
+        ax.axhline(0, color=style.BLACK, linewidth=0.8)
+        places = [_point(ax, variant, values, lost, colours[variant.label]) for variant in variants]
+        shown = [i for i, place in enumerate(places) if np.isfinite(place).all()]
+        names = [(variants[i].label, colours[variants[i].label]) for i in shown]
+        to_place.append((ax, names, [places[i] for i in shown]))
+        ax.margins(0.14)
+        ax.set_xlabel(title)
+        if ax is third:
+            ax.set_xlim(left=0)
+            ax.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True))
+        elif _magnitudes(values):
+            ax.set_xscale("log")
+        else:
+            ax.xaxis.set_major_locator(MaxNLocator(nbins=4))  # numbers of four digits fit side by side
+    first.set_ylabel(f"closed-loop cost above that of\n{reference} [%]")
+    grey: dict[str, Any] = {
+        "linestyle": "none",
+        "color": "#666666",
+        "markeredgecolor": "white",
+        "markersize": 7,
+    }
+    modes = list(dict.fromkeys(variant.mode for variant in variants))
+    handles = [Line2D([], [], marker=MODES.get(mode, "D"), **grey, label=mode) for mode in modes]
+    if any(variant.thesis for variant in variants):
+        look: dict[str, Any] = {**sheet.RING, "color": style.BLACK, "markersize": 10}
+        handles.append(Line2D([], [], **look, label="thesis"))
+    panels.legend_above(first, 4, handles=handles)
+    differ = [str(data[k].attrs.get("long_name", k)) for k in columns(data) if k not in STRUCTURE]
+    words = (
+        "Labels: number of blocks / prediction horizon [samples]. Points are medians, bars quartiles, over up to "
+        f"{max(len(variant.rows) for variant in variants)} runs that differ in {' and '.join(differ or ['nothing'])}; "
+        f"each is compared with {reference} in an otherwise equal run."
     )
-    with sheet.sheet(1, 3, 10.4, 4.6, sharey=True) as (drawn, panels):
-        for ax, (title, values) in zip(panels[0], panels_of, strict=True):
-            ax.axhline(0, color=style.BLACK, linewidth=0.8)
-            names, places = [], []
-            for variant in variants:
-                y = quartiles(lost[variant.rows])
-                x = np.full(3, float(variant.unknowns)) if values is None else quartiles(values[variant.rows])
-                colour = COLOURS[kinds.index(variant.label) % len(COLOURS)]
-                ax.errorbar(
-                    x[1],
-                    y[1],
-                    xerr=[[x[1] - x[0]], [x[2] - x[1]]],
-                    yerr=[[y[1] - y[0]], [y[2] - y[1]]],
-                    marker=MODES.get(variant.mode, "D"),
-                    color=colour,
-                    markersize=7,
-                    markeredgecolor="white",
-                    markeredgewidth=0.6,
-                    elinewidth=1.0,
-                    ecolor=(colour, 0.4),
-                    zorder=3,
-                )
-                if np.isfinite(x[1]) and np.isfinite(y[1]):
-                    names.append((variant.label, colour))
-                    places.append((x[1], y[1]))
-                    if variant.thesis:
-                        sheet.ring(ax, x[1], y[1], label=None, size=13)
-            ax.margins(0.14)
-            ax.set_xlabel(title)
-            if values is None:
-                ax.set_xlim(left=0)
-                ax.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True))
-            elif _magnitudes(values):
-                ax.set_xscale("log")
-            else:
-                ax.xaxis.set_major_locator(MaxNLocator(nbins=4))  # numbers of four digits fit side by side
-            ax.labels_to_place = (names, places)
-        panels[0, 0].set_ylabel(f"closed-loop cost above that of\n{reference} [%]")
-        modes = list(dict.fromkeys(variant.mode for variant in variants))
-        grey: dict[str, Any] = {"linestyle": "none", "color": "#666666", "markeredgecolor": "white"}
-        handles = [Line2D([], [], marker=MODES.get(m, "D"), markersize=7, **grey, label=m) for m in modes]
-        if any(variant.thesis for variant in variants):
-            look: dict[str, Any] = {**sheet.RING, "color": style.BLACK, "markersize": 10}
-            handles.append(Line2D([], [], **look, label="thesis"))
-        panels[0, 0].legend(
-            handles=handles, loc="lower left", bbox_to_anchor=(0, 1.0), ncols=4, borderaxespad=0.1
-        )
-        sheet.write(
-            drawn,
-            data,
-            [
-                "Labels: number of blocks / prediction horizon [samples]. Points are medians, bars quartiles, over up to "
-                f"{runs} runs that differ in {_further(data)}; each is compared with {reference} in an otherwise equal run."
-            ],
-        )
-        drawn.canvas.draw()  # lays out, so that the labels know where the points are
-        drawn.set_layout_engine("none")
-        for ax in panels[0]:
-            place_labels(ax, *ax.labels_to_place)
-        yield drawn
+    sheet.write(drawn, data, [words])
+    drawn.canvas.draw()  # lays out, so that the labels know where the points are
+    drawn.set_layout_engine("none")
+    for ax, names, places in to_place:
+        place_labels(ax, names, places)
+    return drawn
 
 
-def _further(data: xr.Dataset) -> str:
-    names = [str(data[key].attrs.get("long_name", key)) for key in columns(data) if key not in STRUCTURE] or [
-        "nothing"
-    ]
-    return " and ".join(names)
+def _point(
+    ax: Axes, variant: Blocking, values: np.ndarray, lost: np.ndarray, colour: str
+) -> tuple[float, float]:
+    """Median of a variant with its quartiles; where it is."""
+    x, y = quartiles(values[variant.rows]), quartiles(lost[variant.rows])
+    look: dict[str, Any] = {
+        "markersize": 7,
+        "markeredgecolor": "white",
+        "markeredgewidth": 0.6,
+        "color": colour,
+    }
+    look |= {"marker": MODES.get(variant.mode, "D"), "elinewidth": 1.0, "ecolor": (colour, 0.4), "zorder": 3}
+    apart = [[[at[1] - at[0]], [at[2] - at[1]]] for at in (x, y)]
+    ax.errorbar(x[1], y[1], xerr=apart[0], yerr=apart[1], **look)
+    if variant.thesis and np.isfinite((x[1], y[1])).all():
+        sheet.ring(ax, x[1], y[1], label=None, size=13)
+    return x[1], y[1]
 
 
 def _magnitudes(values: np.ndarray) -> bool:
@@ -220,50 +206,35 @@ def place_labels(
     pixel = ax.figure.dpi / 72
     frame = ax.get_window_extent(renderer)
     points = ax.transData.transform(places) if places else np.zeros((0, 2))
-    radius = 5 * pixel
-    taken = [Bbox([point - radius, point + radius]) for point in points]
+    taken = [Bbox([point - 5 * pixel, point + 5 * pixel]) for point in points]
     boxes: list[Bbox] = []
-    order = np.argsort(-points[:, 1], kind="stable") if len(points) else []
-    for i in order:
+    for i in np.argsort(-points[:, 1], kind="stable"):
         (text, colour), point = names[i], points[i]
-        note = ax.annotate(
-            text, places[i], xytext=(0, 0), textcoords="offset points", fontsize=size, color=colour
-        )
+        look: dict[str, Any] = {"textcoords": "offset points", "fontsize": size, "color": colour}
+        note = ax.annotate(text, places[i], xytext=(0, 0), **look)
         extent = note.get_window_extent(renderer)
-        best: tuple[float, Bbox, tuple[float, float]] | None = None
+        note.remove()
+        others = [*taken[:i], *taken[i + 1 :], *boxes]
+        best, least, far = extent, np.inf, False
         for dx, dy in SHIFTS:
-            left = point[0] + dx * pixel - (extent.width if dx < 0 else extent.width / 2 if dx == 0 else 0)
+            left = point[0] + dx * pixel - extent.width * (0.5 - 0.5 * np.sign(dx))
             low = point[1] + dy * pixel - extent.height / 2
             box = Bbox.from_bounds(left, low, extent.width, extent.height)
-            covered = sum(_common(box, other) for k, other in enumerate([*taken, *boxes]) if k != i)
+            covered = sum(_common(box, other) for other in others)
             covered += extent.width * extent.height - _common(box, frame)  # what hangs out
-            if best is None or covered < best[0] - 1e-9:
-                best = covered, box, (dx, dy)
+            if covered < least - 1e-9:
+                best, least, far = box, covered, max(abs(dx), abs(dy)) > 14
             if covered == 0:
                 break
-        assert best is not None
-        boxes.append(best[1])
-        corner = (best[1].x0 - point[0]) / pixel, (best[1].y0 - point[1]) / pixel
-        note.remove()
+        boxes.append(best)
+        corner = (best.x0 - point[0]) / pixel, (best.y0 - point[1]) / pixel
         line = {"arrowstyle": "-", "color": colour, "linewidth": 0.5, "shrinkA": 0, "shrinkB": 4}
-        far = max(abs(best[2][0]), abs(best[2][1])) > 14
-        ax.annotate(
-            text,
-            places[i],
-            xytext=corner,
-            textcoords="offset points",
-            fontsize=size,
-            color=colour,
-            va="bottom",
-            arrowprops=line if far else None,
-            path_effects=[withStroke(linewidth=2, foreground="white")],
-            zorder=4,
-        )
+        look |= {"va": "bottom", "zorder": 4, "path_effects": [withStroke(linewidth=2, foreground="white")]}
+        ax.annotate(text, places[i], xytext=corner, arrowprops=line if far else None, **look)
     return boxes
 
 
 def _common(one: Bbox, other: Bbox) -> float:
     """Area that two boxes share."""
-    width = min(one.x1, other.x1) - max(one.x0, other.x0)
-    height = min(one.y1, other.y1) - max(one.y0, other.y0)
-    return max(width, 0.0) * max(height, 0.0)
+    both = Bbox.intersection(one, other)
+    return both.width * both.height if both is not None else 0.0

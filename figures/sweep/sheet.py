@@ -1,13 +1,11 @@
-"""The sheet that figures of a sweep study are drawn on: a grid of panels, its title, and the caption below."""
+"""What figures of a sweep study share: the title above and the caption below, colour bars, rings."""
 
 from __future__ import annotations
 
-import contextlib
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import xarray as xr
 from matplotlib.artist import Artist
@@ -22,27 +20,6 @@ from figures import style
 RING: dict[str, Any] = {"marker": "o", "linestyle": "none", "markerfacecolor": "none"}
 CHARACTERS = 18.0  # of the caption, per inch
 LEGEND_AT = 0.24  # below the top [inch]
-
-
-@contextlib.contextmanager
-def sheet(
-    rows: int, columns: int, width: float, height: float, **options
-) -> Iterator[tuple[Figure, np.ndarray]]:
-    """Panels ``"row column"`` in the house style, closed at the end.
-
-    Args:
-        rows: of panels.
-        columns: of panels.
-        width: of the figure [inch].
-        height: of the figure [inch].
-        **options: for `matplotlib.pyplot.subplots`.
-    """
-    with plt.rc_context(style.RC):
-        drawn, axes = plt.subplots(rows, columns, figsize=(width, height), squeeze=False, **options)
-        try:
-            yield drawn, axes
-        finally:
-            plt.close(drawn)
 
 
 def write(drawn: Figure, data: xr.Dataset, lines: Iterable[str], legend: Sequence[Artist] = ()) -> None:

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
+import itertools
+from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from figures import style
 from figures.sweep import sheet
-from figures.sweep.data import SweepAxis, deviation, figure_of, sweep_axes, thesis_tuning, unit
+from figures.sweep.data import SweepAxis, deviation, figure_of, sweep_axes, thesis_tuning
 from jaxmpc.errors import InputError
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "d")
+COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, *style.SPARE_COLOURS)
 MAP = "viridis"
 MANY = 300  # points, from which on they are drawn smaller
 SPREAD = 30.0  # largest over smallest value of an axis that is drawn logarithmically
@@ -45,6 +44,7 @@ def front(x, y) -> np.ndarray:
     return on
 
 
+@style.house_style
 def pareto(
     data: xr.Dataset,
     x: str = "choke_travel",
@@ -68,16 +68,12 @@ def pareto(
         axes: to draw on; a figure of its own otherwise.
 
     Returns:
-        The axes; `axes.figure` is the figure, unknown to pyplot unless `axes` was given.
+        The axes; `axes.figure` is the figure.
 
     Raises:
         InputError: for a key figure or column that is not there.
     """
-    if axes is None:
-        with plt.rc_context(style.RC):
-            own = Figure(figsize=(7.6, 5.0), layout="constrained")
-            FigureCanvasAgg(own)
-            return pareto(data, x, y, color, marker=marker, cv=cv, axes=own.add_subplot())
+    axes = axes or style.figure(1, row_height=4.5)[1][0]
     (across, x_title), (up, y_title) = _figure(data, x, cv), _figure(data, y, cv)
     known = sweep_axes(data)
     coloured = _pick(data, known, color) if color else next((a for a in known if a.numeric), None)
@@ -98,26 +94,25 @@ def pareto(
     return axes
 
 
-@contextlib.contextmanager
-def draw(data: xr.Dataset) -> Iterator[Figure]:
+def draw(data: xr.Dataset) -> Figure:
     """The figure of a study.
 
     Args:
         data: finished scenarios.
     """
-    with sheet.sheet(1, 1, 7.6, 5.3) as (drawn, panels):
-        axes = pareto(data, axes=panels[0, 0])
-        across, up = figure_of(data, "choke_travel").values, deviation(data).values
-        lost = int((~(np.isfinite(across) & np.isfinite(up))).sum())
-        lines = [
-            "One point per scenario; the line joins those that no other beats in both. The deviation of each CV is "
-            "divided by its deadzone in the thesis (1000 and 5 m3/h), then averaged.",
-            *linked_sentences(data),
-            f"Not drawn, without finite figures: {lost} of the finished scenarios." if lost else "",
-        ]
-        sheet.write(drawn, data, lines)
-        axes.set_title("Choke wear against deviation", loc="left")
-        yield drawn
+    drawn, ((axes,),) = style.grid(1, 1, 7.6, 5.3)
+    pareto(data, axes=axes)
+    finite = np.isfinite(figure_of(data, "choke_travel").values) & np.isfinite(deviation(data).values)
+    lost = int((~finite).sum())
+    lines = [
+        "One point per scenario; the line joins those that no other beats in both. The deviation of each CV is "
+        "divided by its deadzone in the thesis (1000 and 5 m3/h), then averaged.",
+        *linked_sentences(data),
+        f"Not drawn, without finite figures: {lost} of the finished scenarios." if lost else "",
+    ]
+    sheet.write(drawn, data, lines)
+    axes.set_title("Choke wear against deviation", loc="left")
+    return drawn
 
 
 def linked_sentences(data: xr.Dataset) -> list[str]:
@@ -137,18 +132,18 @@ def _figure(data: xr.Dataset, name: str, cv: str | None) -> tuple[np.ndarray, st
     values = figure_of(data, name)
     words, units = str(values.attrs.get("long_name", name)), str(values.attrs.get("units", "1"))
     if values.dims == ("scenario",):
-        return values.values.astype(float), f"{_TITLES.get(name, words)} [{unit(units)}]"
+        return values.values.astype(float), f"{_TITLES.get(name, words)} [{style.unit(units)}]"
     if values.dims != ("scenario", "cv"):
         raise InputError(name, list(values.dims), "a key figure of the scenario, or one per CV")
     if cv is None:
         if "cv_unit" not in units:
-            return values.mean("cv", skipna=False).values, f"{words}, mean of the CVs [{unit(units)}]"
-        rest = unit(units.replace("cv_unit", "").strip() or "1")
+            return values.mean("cv", skipna=False).values, f"{words}, mean of the CVs [{style.unit(units)}]"
+        rest = style.unit(units.replace("cv_unit", "").strip() or "1")
         return deviation(data, name=name).values, f"{_TITLES.get(name, words)} / thesis deadzone [{rest}]"
     if cv not in data.cv.values:
         raise InputError("cv", cv, f"one of {', '.join(map(str, data.cv.values))}")
     shown = units.replace("cv_unit", str(data.cv_unit.sel(cv=cv).item()))
-    return values.sel(cv=cv).values, f"{words}, {style.NAMES.get(cv, cv)} [{unit(shown)}]"
+    return values.sel(cv=cv).values, f"{words}, {style.name_of(cv)} [{style.unit(shown)}]"
 
 
 _TITLES = {"choke_travel": "choke travel", "mean_absolute_deviation": "mean absolute deviation"}
@@ -173,52 +168,41 @@ def _marker_axis(known: list[SweepAxis], coloured: SweepAxis | None) -> SweepAxi
 def _points(
     axes: Axes, x: np.ndarray, y: np.ndarray, coloured: SweepAxis | None, shaped: SweepAxis | None
 ) -> None:
-    look: dict = {"s": 34, "linewidth": 0.4, "edgecolor": "white", "zorder": 3}
-    if len(x) > MANY:
-        look |= {"s": 14, "linewidth": 0.25}
+    small = len(x) > MANY
+    look: dict[str, Any] = {"s": 14 if small else 34, "linewidth": 0.25 if small else 0.4}
+    look |= {"edgecolor": "white", "zorder": 3}
+    paints = np.full(len(x), style.BLUE, dtype=object)
+    handles: list[Line2D] = []
+    titles = []
+    grey: dict[str, Any] = {"linestyle": "none", "markersize": 6, "markeredgecolor": "white"}
     if coloured is not None and coloured.numeric:
-        numbers = coloured.values.astype(float)
-        log = coloured.scale == "log" and numbers.max() > 10 * numbers.min()
-        look["norm"] = (LogNorm if log else Normalize)(numbers.min(), numbers.max())
-        look["cmap"] = MAP
-    marks = shaped.unique if shaped is not None else [None]
-    for i, value in enumerate(marks):
-        rows = np.flatnonzero(shaped.values == value) if shaped is not None else np.arange(len(x))
-        paint: dict = {"color": style.BLUE}
-        if coloured is not None:
-            paint = {"c": coloured.values[rows]} if coloured.numeric else {"color": _texts(coloured, rows)}
-        drawn = axes.scatter(x[rows], y[rows], marker=MARKERS[i % len(MARKERS)], **paint, **look)
-        if i == 0 and "norm" in look and coloured is not None:
-            bar = sheet.colour_bar(drawn, axes, coloured.title, pad=0.015, aspect=30)
-            if isinstance(look["norm"], LogNorm) and len(coloured.unique) <= 10:
-                bar.set_ticks(coloured.unique, labels=[f"{v:g}" for v in coloured.unique])
-    grey: dict = {"linestyle": "none", "markersize": 6, "markeredgecolor": "white"}
-    handles, titles = [], []
-    if coloured is not None and not coloured.numeric:
+        paints = coloured.values.astype(float)
+        log = coloured.scale == "log" and paints.max() > 10 * paints.min()
+        look |= {"norm": (LogNorm if log else Normalize)(paints.min(), paints.max()), "cmap": MAP}
+    elif coloured is not None:
+        shades = dict(zip(coloured.unique, itertools.cycle(COLOURS)))
+        paints = np.array([shades[value] for value in coloured.values])
         titles.append(coloured.title)
-        firsts = [int(np.flatnonzero(coloured.values == v)[0]) for v in coloured.unique]
-        for value, shade in zip(coloured.unique, _texts(coloured, np.array(firsts)), strict=True):
-            handles.append(Line2D([], [], marker="o", **grey, color=shade, label=str(value)))
-    if shaped is not None:
+        handles += [Line2D([], [], marker="o", **grey, color=s, label=str(v)) for v, s in shades.items()]
+    if shaped is None:
+        drawn = axes.scatter(x, y, marker=MARKERS[0], c=paints, **look)
+    else:
         titles += [shaped.title] if shaped.key != "controller" else []
-        for mark, value in zip(MARKERS, marks, strict=False):
-            handles.append(Line2D([], [], marker=mark, **grey, color="#666666", label=_short(shaped, value)))
+        for mark, value in zip(itertools.cycle(MARKERS), shaped.unique):
+            rows = shaped.values == value
+            drawn = axes.scatter(x[rows], y[rows], marker=mark, c=paints[rows], **look)
+            words = f"{value:g}" if shaped.numeric else str(value)
+            handles.append(Line2D([], [], marker=mark, **grey, color="#666666", label=words))
+    if coloured is not None and coloured.numeric:
+        bar = sheet.colour_bar(drawn, axes, coloured.title, pad=0.015, aspect=30)
+        if log and len(coloured.unique) <= 10:
+            bar.set_ticks(coloured.unique, labels=[f"{v:g}" for v in coloured.unique])
     handles.append(Line2D([], [], color=style.BLACK, linewidth=1.0, label="front"))
     axes.legend(
         handles=handles,
         title=", ".join(titles) or None,
-        loc="best" if len(x) <= MANY else "upper right",  # searching takes long among many points
+        loc="best" if not small else "upper right",  # searching takes long among many points
         fontsize=8,
         title_fontsize=8,
         ncols=1 + (len(handles) > 6),
     )
-
-
-def _short(axis: SweepAxis, value) -> str:
-    return f"{value:g}" if axis.numeric else str(value)
-
-
-def _texts(axis: SweepAxis, rows: np.ndarray) -> list[str]:
-    colours = (style.BLUE, style.VERMILLION, style.GREEN, *style.SPARE_COLOURS)
-    places = {value: i for i, value in enumerate(axis.unique)}
-    return [colours[places[axis.values[row]] % len(colours)] for row in rows]

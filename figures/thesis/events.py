@@ -1,18 +1,23 @@
-"""Thesis figures 29, 30 (fine regulation of the oil rate) and 31 to 33 (a pressure drop): one run, one event marked."""
+"""Thesis figures 29, 30 (fine regulation of the oil rate, 7.2.4) and 31 to 33 (a pressure drop, 7.2.5)."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
 from figures import panels, style
-from figures.thesis import tracking
+from figures.figure import FigureEntry
+from figures.thesis import runs
+from figures.thesis.facts import between, settled
 from jaxmpc.errors import InputError
+from studies.definition.presets import CHOKE, GAS, LIFT, OIL
 from studies.store.comparison import provenance
+
+INTEGER = "mixed-integer"
+When = Callable[[xr.Dataset, str], float]
 
 
 def retuned_at(data: xr.Dataset, controller: str) -> float:
@@ -27,7 +32,7 @@ def retuned_at(data: xr.Dataset, controller: str) -> float:
     raise InputError("results.definition", controller, "a controller whose tuning changes during the run")
 
 
-def disturbed_at(data: xr.Dataset) -> float:
+def disturbed_at(data: xr.Dataset, _controller: str = INTEGER) -> float:
     """When the reservoir pressure first leaves its nominal value [s].
 
     Raises:
@@ -39,46 +44,120 @@ def disturbed_at(data: xr.Dataset) -> float:
     return float(data.time.values[away[0]])
 
 
-@contextlib.contextmanager
-def rates(data: xr.Dataset, controller: str, at: float, what: str) -> Iterator[Figure]:
+def rates(data: xr.Dataset, controller: str, when: When) -> Figure:
     """Measured CVs with setpoints and deadzones, and the event marked.
 
     Args:
         data: results.
         controller: name of a finished run.
-        at: time of the event [s].
-        what: happens there.
+        when: finds the time of the event.
     """
-    with tracking.rates(data, controller) as drawn:
-        _mark(drawn, data, at, what)
-        yield drawn
+    return _marked(runs.rates(data, controller), data, when(data, controller))
 
 
-@contextlib.contextmanager
-def inputs(data: xr.Dataset, controller: str, at: float, what: str) -> Iterator[Figure]:
+def inputs(data: xr.Dataset, controller: str, when: When) -> Figure:
     """Choke and lift, and the event marked; arguments of `rates`."""
-    with tracking.inputs(data, controller) as drawn:
-        _mark(drawn, data, at, what)
-        yield drawn
+    return _marked(runs.inputs(data, controller), data, when(data, controller))
 
 
-@contextlib.contextmanager
-def pressure(data: xr.Dataset) -> Iterator[Figure]:
-    """Figure 33: the reservoir-pressure offset of the run; `data` are the results of the study ``disturbance``."""
-    with style.figure(1, row_height=2.6) as (drawn, (axes,)):
-        seconds = panels.time_axis(axes, *panels.span(data))
-        t = np.append(data.time.values, panels.span(data)[1]) / seconds
-        values = data.disturbance.values
-        axes.step(t, np.append(values, values[-1]), where="post", color=style.BLACK)
-        axes.set_ylabel("reservoir pressure:\noffset from nominal [bar]")
-        panels.limits(axes, data.disturbance)
-        yield drawn
-
-
-def _mark(drawn: Figure, data: xr.Dataset, at: float, what: str) -> None:
-    start, end = panels.span(data)
-    seconds = panels.time_unit(start, end)[0]
+def _marked(drawn: Figure, data: xr.Dataset, at: float) -> Figure:
+    drop = float(data.disturbance.min())
+    words = f"{style.signed(drop)} bar" if drop else "gas weights zero"
+    seconds = panels.time_unit(*panels.span(data))[0]
     for ax in drawn.axes:
-        panels.mark(ax, at / seconds, what)
+        panels.mark(ax, at / seconds, words)
         if ax.get_legend() is not None or ax is drawn.axes[0]:
             panels.legend_above(ax, 4)
+    return drawn
+
+
+def pressure(data: xr.Dataset) -> Figure:
+    """Figure 33: the reservoir-pressure offset of the run; `data` are the results of the study ``disturbance``."""
+    drawn, (axes,) = style.figure(1, row_height=2.6)
+    seconds = panels.time_axis(axes, *panels.span(data))
+    panels.step(axes, data, data.disturbance, seconds, color=style.BLACK)
+    axes.set_ylabel("reservoir pressure:\noffset from nominal [bar]")
+    panels.limits(axes, data.disturbance)
+    return drawn
+
+
+def retuned_caption(data: xr.Dataset, controller: str, when: When) -> str:
+    """Figure 29: what the run settles at before and after."""
+    at = when(data, controller)
+    before, after = settled(between(data, 0.0, at, closed=False), controller), settled(data, controller)
+    return (
+        f"Until {at:,.0f} s the controller settles {style.signed(before[OIL], '.1f')} m³/h of oil and "
+        f"{style.signed(before[GAS], '.0f')} m³/h of gas off two setpoints that are out of reach together. "
+        f"Without gas weights the oil rate closes in on its setpoint: {style.signed(after[OIL], '.1f')} m³/h "
+        f"off at the end, and gas {style.signed(after[GAS], '.0f')} m³/h."
+    )
+
+
+def disturbed_caption(data: xr.Dataset, controller: str, when: When) -> str:
+    """Figure 31: how far the oil rate falls, and what the run settles at."""
+    after = between(data, when(data, controller))
+    run = after.sel(controller=controller, cv=OIL)
+    fall, end = float((run.setpoint - run.measurement).max()), settled(after, controller)
+    compromise = (
+        " More lift would bring the oil back and take the gas rate up: the weights settle in between."
+    )
+    return (
+        f"The pressure drop takes the oil rate up to {fall:.1f} m³/h below its setpoint. It ends "
+        f"{style.signed(end[OIL], '.1f')} m³/h off, the gas rate {style.signed(end[GAS], '.0f')} m³/h."
+        f"{compromise if abs(end[OIL]) > panels.soft_half_width(run) else ''}"
+    )
+
+
+def inputs_caption(data: xr.Dataset, controller: str, when: When) -> str:
+    """Figures 30 and 32: where the MVs go."""
+    at = when(data, controller)
+    before = int(np.searchsorted(data.time.values, at)) - 1
+    position = data.position.sel(controller=controller)
+    lift, choke = (position.sel(mv=mv).values[[before, -1]] for mv in (LIFT, CHOKE))
+    moved = f"the choke from {choke[0]:.0f} to {choke[1]:.0f} %"
+    return (
+        f"From {at:,.0f} s to the end the controller takes the lift from {lift[0]:.0f} to {lift[1]:.0f} m³/h "
+        f"and {moved if choke[0] != choke[1] else f'leaves the choke at {choke[0]:.0f} %'}."
+    )
+
+
+def pressure_caption(data: xr.Dataset) -> str:
+    """Size and time of the drop."""
+    return (
+        f"The disturbance of figures 31 and 32: the reservoir pressure changes by {style.signed(data.disturbance.min())} "
+        f"bar at {disturbed_at(data):,.0f} s and stays there; the controller is not told."
+    )
+
+
+ENTRIES = (
+    *(
+        FigureEntry(
+            str(id),
+            f"{what}: {words}",
+            study,
+            f"figure_{id}_{function.__name__}_{study.replace('-', '_')}",
+            function,
+            caption,
+            f"{alt} A dotted line marks the event.",
+            (INTEGER,),
+            {"controller": INTEGER, "when": when},
+        )
+        for first, study, what, rates_caption, when in (
+            (29, "fine-regulation", "fine regulation of the oil rate", retuned_caption, retuned_at),
+            (31, "disturbance", "drop of the reservoir pressure", disturbed_caption, disturbed_at),
+        )
+        for id, words, function, caption, alt in (
+            (first, "oil and gas rate", rates, rates_caption, runs.RATES_ALT),
+            (first + 1, "choke and gas lift", inputs, inputs_caption, runs.INPUTS_ALT),
+        )
+    ),
+    FigureEntry(
+        "33",
+        "the disturbance",
+        "disturbance",
+        "figure_33_pressure",
+        pressure,
+        pressure_caption,
+        "A step plot over time: offset of the reservoir pressure.",
+    ),
+)

@@ -1,43 +1,65 @@
-"""Thesis figures 27 and 28: the first plan carried out to its end without feedback, against the closed loop."""
+"""Thesis figures 27 and 28: the first plan carried out to its end without feedback, against the closed loop (7.2.3)."""
 
 from __future__ import annotations
-
-import contextlib
-from collections.abc import Iterator
 
 import xarray as xr
 from matplotlib.figure import Figure
 
 from figures import panels, style
-from figures.thesis import plans
+from figures.figure import FigureEntry
+from figures.thesis.facts import settled
+from figures.thesis.plans import first_change
+from studies.definition.presets import CHOKE, GAS, LIFT, OIL
 
-RUNS = (("closed-loop", "closed loop", None), ("open-loop", "open loop", style.PLAN))  # name, label, colour
+CLOSED, OPEN = "closed-loop", "open-loop"
+CURVES = {CLOSED: ("closed loop", None), OPEN: ("open loop", style.PLAN)}
 
 
-@contextlib.contextmanager
-def rates(data: xr.Dataset) -> Iterator[Figure]:
-    """Oil and gas rate of both runs; `data` are the results of the study ``predictions``."""
-    names = panels.cv_names(data)
-    with style.figure(2) as (drawn, axes):
-        seconds = panels.time_axis(axes[-1], *panels.span(data))
-        for ax, cv in zip(axes, names, strict=True):
-            panels.deadzone_lines(ax, data, RUNS[0][0], cv, seconds)
-            for name, label, colour in RUNS:
-                panels.measured(ax, data, name, cv, seconds, label, colour)
-            panels.setpoint(ax, data, cv, seconds)
-            panels.mark(ax, plans.first_change(data) / seconds)
+def compared(data: xr.Dataset, channels: tuple[str, str]) -> Figure:
+    """Two CVs or two MVs of both runs; `data` are the results of the study ``predictions``."""
+    drawn, axes = style.figure(2)
+    seconds = panels.time_axis(axes[-1], *panels.span(data))
+    for ax, channel in zip(axes, channels, strict=True):
+        panels.compared(ax, data, channel, CURVES, seconds, zone=CLOSED)
+        panels.mark(ax, first_change(data) / seconds)
+        if panels.is_cv(data, channel) or ax is axes[0]:
             panels.legend_above(ax, 4)
-        yield drawn
+    return drawn
 
 
-@contextlib.contextmanager
-def inputs(data: xr.Dataset) -> Iterator[Figure]:
-    """Choke and lift of both runs; arguments of `rates`."""
-    with style.figure(2) as (drawn, axes):
-        seconds = panels.time_axis(axes[-1], *panels.span(data))
-        for ax, mv in zip(axes, ("choke", "gas_lift"), strict=True):
-            for name, label, colour in RUNS:
-                panels.manipulated(ax, data, name, mv, seconds, legend=False, label=label, colour=colour)
-            panels.mark(ax, plans.first_change(data) / seconds)
-        panels.legend_above(axes[0])
-        yield drawn
+def caption(data: xr.Dataset, channels: tuple[str, str]) -> str:
+    """Where each run ends."""
+    if channels == (OIL, GAS):
+        off = settled(data, OPEN), settled(data, CLOSED)
+        (open_oil, open_gas), (oil, gas) = (
+            (style.signed(run[OIL], ".1f"), style.signed(run[GAS], ".0f")) for run in off
+        )
+        return (
+            f"The plan carried out without feedback settles {open_oil} m³/h of oil and {open_gas} m³/h of gas off the "
+            f"setpoints, the closed loop {oil} and {gas} m³/h."
+        )
+    last = data.position.isel(time=-1)
+    ends = [
+        f"{last.sel(controller=name, mv=CHOKE).item():.0f} % and {last.sel(controller=name, mv=LIFT).item():.0f} m³/h"
+        for name in (OPEN, CLOSED)
+    ]
+    return f"The plan ends at a choke and a lift of {ends[0]}; feedback leads to {ends[1]} instead."
+
+
+ENTRIES = tuple(
+    FigureEntry(
+        id,
+        f"{words}: open against closed loop",
+        "predictions",
+        f"figure_{id}_{kind}_open_loop",
+        compared,
+        caption,
+        f"Two {plots} over time, {order}, each with an open-loop and a closed-loop curve.",
+        (CLOSED, OPEN),
+        {"channels": channels},
+    )
+    for id, kind, words, plots, order, channels in (
+        ("27", "rates", "oil and gas rate", "line plots", "oil rate above gas rate", (OIL, GAS)),
+        ("28", "inputs", "choke and gas lift", "step plots", "choke above gas lift", (CHOKE, LIFT)),
+    )
+)

@@ -1,67 +1,58 @@
 """Thesis figures 25, 26 (a plan, and what came of it) and 36 to 38 (prediction against response in an oscillation).
 
-The past is white and what lies ahead grey. Plans come from `studies.thesis.plans`, which rebuilds them from what is stored.
+The past is white and what lies ahead grey. Plans come from `studies.thesis.plans`, which rebuilds them from what is stored;
+`draw_plan` is also what the app (`figures.explore`) shows of a plan.
 """
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
 from figures import panels, style
-from figures.facts import index_of
+from figures.figure import FigureEntry
+from figures.thesis.facts import between, turns
 from jaxmpc.errors import InputError
-from studies.kpi import loop as kpi
+from studies.definition.presets import CHOKE, GAS, LIFT, OIL
 from studies.kpi.evaluate import NEAR_CLOSED
 from studies.thesis.plans import StoredPlan, plan_at
 
 BEFORE = 600.0  # s of the past to show
 MINUTE = 60.0
 SWING = (300.0, 600.0)  # s, at least, to show before and after the moves of an oscillation
+WORDS = ("first", "second", "third")
+PREDICTED = "closed-loop"  # the controller of figures 25 to 28
 
 
-@contextlib.contextmanager
-def planned(data: xr.Dataset, controller: str) -> Iterator[Figure]:
+def planned(data: xr.Dataset, controller: str) -> Figure:
     """Figure 25: the plan made when the setpoints first change: rates, inputs and moves over the horizon.
 
     Args:
         data: results of the study ``predictions``.
         controller: name of a run whose plans are stored.
     """
-    at = first_change(data)
-    plan = plan_at(data, controller, at)
-    with _six_panels(data, controller, at, plan) as (drawn, rows):
-        past = _between(data, at - BEFORE, at)  # the CV of that time is known, the move is not made yet
-        for ax in rows.flat:
-            ax.axvspan(at / MINUTE, ax.get_xlim()[1], color=style.FUTURE, linewidth=0, zorder=0)
-            panels.mark(ax, at / MINUTE)
-        _evolution(rows, past, past.isel(time=slice(-1)), controller)
-        _plan(rows, data, plan, "-")
-        _legend(drawn, rows)
-        yield drawn
+    plan = first_plan(data, controller)
+    return _six_panels(data, controller, plan, known=plan.time)
 
 
-@contextlib.contextmanager
-def evolved(data: xr.Dataset, controller: str) -> Iterator[Figure]:
+def evolved(data: xr.Dataset, controller: str) -> Figure:
     """Figure 26: what the controller did after that change, and the first plan beside it; arguments of `planned`."""
-    at = first_change(data)
-    plan = plan_at(data, controller, at)
-    with _six_panels(data, controller, at, plan) as (drawn, rows):
-        whole = _between(data, at - BEFORE, at + _horizon(plan))
-        for ax in rows.flat:
-            panels.mark(ax, at / MINUTE)
-        _plan(rows, data, plan, "--")
-        _evolution(rows, whole, whole, controller)
-        _legend(drawn, rows)
-        yield drawn
+    return _six_panels(data, controller, first_plan(data, controller), known=np.inf, grey=False, line="--")
 
 
-@contextlib.contextmanager
-def swing(data: xr.Dataset, controller: str, which: int) -> Iterator[Figure]:
+def _six_panels(data: xr.Dataset, controller: str, plan: StoredPlan, **options: Any) -> Figure:
+    start, end = panels.span(data)
+    drawn, rows = style.grid(3, 2, 9.6, 6.5, sharex=True)
+    shown = max(plan.time - BEFORE, start), min(float(plan.cv_time[-1]), end)
+    draw_plan(rows, data, controller, plan, shown, **options)
+    panels.shared_legend(drawn, rows.flat)
+    return drawn
+
+
+def swing(data: xr.Dataset, controller: str, which: int) -> Figure:
     """Figures 36, 37, 38: what a move of an oscillation was to bring, and what it brought.
 
     Args:
@@ -70,33 +61,89 @@ def swing(data: xr.Dataset, controller: str, which: int) -> Iterator[Figure]:
         which: 0, 1 or 2: the first, second or third move.
     """
     moves = swing_moves(data, controller)
-    at = float(moves[which])
-    plan = plan_at(data, controller, at)
+    plan = plan_at(data, controller, moves[which])
     length = moves[2] - moves[0]
     start = max(moves[0] - max(SWING[0], length / 2), panels.span(data)[0])
     end = min(moves[2] + max(SWING[1], length), panels.span(data)[1])
-    shown = _between(data, start, end)
-    with style.grid(2, 2, sharex=True) as (drawn, rows):
-        for ax in rows.flat:
-            ax.axvspan(at / MINUTE, end / MINUTE, color=style.FUTURE, linewidth=0, zorder=0)
-            panels.mark(ax, at / MINUTE)
-        for ax, cv in zip(rows[0], panels.cv_names(data), strict=True):
-            panels.deadzone_lines(ax, shown, controller, cv, MINUTE)
-            values = plan.cv[:, index_of(data.cv, cv)]
-            inside = plan.cv_time <= end
-            t = plan.cv_time[inside] / MINUTE
-            ax.plot(t, values[inside], color=style.PLAN, linewidth=1.8, label="plan")
-            panels.measured(ax, shown, controller, cv, MINUTE, "actual")
-            panels.setpoint(ax, shown, cv, MINUTE)
-        for ax, mv in zip(rows[1], ("choke", "gas_lift"), strict=True):
-            t, values = _held_plan(data, plan, mv)
-            ax.step(t / MINUTE, values, where="post", color=style.PLAN, linewidth=1.8, label="plan")
-            panels.manipulated(ax, shown, controller, mv, MINUTE, legend=False)
-            panels.time_axis(ax, start, end, bins=8)
-        word = ("first", "second", "third")[which]
-        size = f"{plan.move[0, index_of(data.mv, 'choke')]:+g}".replace("-", "−")
-        _legend(drawn, rows, f"{word} turn: choke {size} % at {at:,.0f} s")
-        yield drawn
+    drawn, rows = style.grid(2, 2, 9.6, 4.5, sharex=True)
+    draw_plan(rows, data, controller, plan, (start, end), known=np.inf)
+    size = style.signed(plan.move[0, index_of(data.mv, CHOKE)])
+    title = f"{WORDS[which]} turn: choke {size} % at {plan.time:,.0f} s"
+    panels.shared_legend(drawn, rows.flat, title=title)
+    return drawn
+
+
+def draw_plan(
+    rows: np.ndarray,
+    data: xr.Dataset,
+    controller: str,
+    plan: StoredPlan,
+    shown: tuple[float, float],
+    *,
+    known: float,
+    pale: bool = False,
+    grey: bool = True,
+    line: str = "-",
+) -> None:
+    """A plan with its prediction, and what happened.
+
+    Args:
+        rows: axes ``"row column"``: CVs, MVs, and in a third row, if there is one, the moves of the MVs.
+        data: results of `controller` among others.
+        controller: whose plan it is.
+        plan: to draw.
+        shown: start and end of the time axis [s].
+        known: time until which what happened is drawn [s].
+        pale: whether what happened later is drawn too, pale.
+        grey: whether what lies after the plan is grey.
+        line: of the plan.
+    """
+    whole, colour = between(data, *shown), panels.run_colour(data, controller)
+    # the CVs of the time `known` are measured, the moves are not made yet
+    parts = [(between(whole, 0.0, known), between(whole, 0.0, known, closed=False), "actual", 1.0)]
+    if pale:
+        parts.insert(0, (between(whole, known), between(whole, known), "_later", 0.4))
+    for ax in rows.flat:
+        panels.time_axis(ax, *shown, bins=8)
+        ax.set_xlabel("time [min]" if ax in rows[-1] else "")
+        ax.set_xlim(*np.array(shown) / MINUTE)
+        panels.mark(ax, plan.time / MINUTE)
+        if grey:
+            ax.axvspan(plan.time / MINUTE, shown[1] / MINUTE, color=style.FUTURE, linewidth=0, zorder=0)
+    look: dict[str, Any] = {"linestyle": line, "color": style.PLAN, "linewidth": 1.6, "label": "plan"}
+    inside = plan.cv_time <= shown[1]
+    for ax, cv in zip(rows[0], panels.cv_names(data), strict=False):
+        panels.deadzone_lines(ax, whole, controller, cv, MINUTE)
+        panels.setpoint(ax, whole, cv, MINUTE)
+        ax.plot(plan.cv_time[inside] / MINUTE, plan.cv[inside, index_of(data.cv, cv)], **look)
+        for seen, _, label, strength in parts:
+            panels.measured(ax, seen, controller, cv, MINUTE, label, colour, alpha=strength)
+    t = np.append(plan.move_time, [plan.move_time[-1] + plan.dt, plan.cv_time[-1]]) / MINUTE
+    for column, mv in zip(rows[1:].T, panels.mv_names(data), strict=False):
+        i = index_of(data.mv, mv)
+        kinds = (("position", "", plan.mv, plan.mv[-1, i]), ("move", " move", plan.move, 0.0))
+        for ax, (name, words, values, after) in zip(column, kinds, strict=False):
+            ax.step(t, np.append(values[:, i], [after, after]), where="post", **look)
+            for _, made, label, strength in parts:
+                if made.sizes["time"]:
+                    done = made[name].sel(controller=controller, mv=mv)
+                    panels.step(ax, made, done, MINUTE, color=colour, alpha=strength, label=label)
+            ax.set_ylabel(panels.label_of(data, mv, words))
+
+
+def index_of(names: xr.DataArray, name: str) -> int:
+    """Position of a name in a coordinate."""
+    return [str(known) for known in names.values].index(name)
+
+
+def first_change(data: xr.Dataset) -> float:
+    """When the setpoints change for the first time [s]."""
+    return float(data.time.values[int(np.flatnonzero(data.window.values > 0)[0])])
+
+
+def first_plan(data: xr.Dataset, controller: str) -> StoredPlan:
+    """The plan made then."""
+    return plan_at(data, controller, first_change(data))
 
 
 def swing_moves(data: xr.Dataset, controller: str) -> tuple[float, float, float]:
@@ -107,9 +154,8 @@ def swing_moves(data: xr.Dataset, controller: str) -> tuple[float, float, float]
     Raises:
         InputError: if the choke turns back fewer than three times in every window.
     """
-    position = data.position.sel(controller=controller, mv="choke").values
     window = data.window.values
-    turn = np.asarray(kpi.reversal_events(np.diff(position, prepend=position[:1]), segment=window))
+    turn, position = turns(data, controller, window)
     near = turn & (position < NEAR_CLOSED)
     turn = near if np.bincount(window, weights=near).max() >= 3 else turn
     at = np.flatnonzero(turn & (window == np.bincount(window, weights=turn).argmax()))
@@ -120,81 +166,95 @@ def swing_moves(data: xr.Dataset, controller: str) -> tuple[float, float, float]
     return one, two, three
 
 
-def first_change(data: xr.Dataset) -> float:
-    """When the setpoints change for the first time [s]."""
-    return float(data.time.values[int(np.flatnonzero(data.window.values > 0)[0])])
-
-
-def _between(data: xr.Dataset, start: float, end: float) -> xr.Dataset:
-    inside = np.flatnonzero((data.time.values >= start) & (data.time.values <= end))
-    return data.isel(time=inside)
-
-
-def _horizon(plan: StoredPlan) -> float:
-    return len(plan.cv) * plan.dt
-
-
-def _held_plan(data: xr.Dataset, plan: StoredPlan, mv: str) -> tuple[np.ndarray, np.ndarray]:
-    """Times [s] and planned values of an MV, held to the end of the prediction horizon."""
+def planned_caption(data: xr.Dataset, controller: str) -> str:
+    """Where the plan ends."""
+    plan = first_plan(data, controller)
+    end = dict(zip(map(str, data.mv.values), plan.mv[-1], strict=True))
+    off = _off_setpoint(data, plan, dict(zip(map(str, data.cv.values), plan.cv[-1], strict=True)))
+    moving = np.flatnonzero(np.abs(plan.move[:, index_of(data.mv, CHOKE)]) > 0)
+    minutes = (moving[-1] + 1) * plan.dt / 60 if moving.size else 0.0
     return (
-        np.append(plan.move_time, plan.cv_time[-1]),
-        np.append(plan.mv[:, index_of(data.mv, mv)], plan.mv[-1, index_of(data.mv, mv)]),
+        f"At the step of the setpoints the controller plans to bring the choke to {end[CHOKE]:.0f} % within {minutes:.1f} "
+        f"minutes and the lift to {end[LIFT]:.0f} m³/h, and expects to end {style.signed(off[OIL], '.1f')} m³/h of oil "
+        f"and {style.signed(off[GAS], '.0f')} m³/h of gas off the setpoints."
     )
 
 
-def _plan(rows: np.ndarray, data: xr.Dataset, plan: StoredPlan, line: str) -> None:
-    for ax, cv in zip(rows[0], panels.cv_names(data), strict=True):
-        values = plan.cv[:, index_of(data.cv, cv)]
-        ax.plot(plan.cv_time / MINUTE, values, line, color=style.PLAN, linewidth=1.6, label="plan")
-    for ax, below, mv in zip(rows[1], rows[2], ("choke", "gas_lift"), strict=True):
-        t, values = _held_plan(data, plan, mv)
-        ax.step(t / MINUTE, values, line, where="post", color=style.PLAN, linewidth=1.6, label="plan")
-        moves = np.append(plan.move[:, index_of(data.mv, mv)], [0.0, 0.0])
-        t = np.append(plan.move_time, [plan.move_time[-1] + plan.dt, plan.cv_time[-1]])
-        below.step(t / MINUTE, moves, line, where="post", color=style.PLAN, linewidth=1.6)
+def evolved_caption(data: xr.Dataset, controller: str) -> str:
+    """Where the run is at the end of that plan."""
+    plan = first_plan(data, controller)
+    end = int(np.searchsorted(data.time.values, plan.cv_time[-1], side="right")) - 1
+    run = data.sel(controller=controller).isel(time=end)
+    off = _off_setpoint(data, plan, {cv: run.measurement.sel(cv=cv).item() for cv in (GAS, OIL)})
+    choke, lift = (
+        f"{run.position.sel(mv=mv).item():.0f} {unit} (planned {plan.mv[-1, index_of(data.mv, mv)]:.0f} {unit})"
+        for mv, unit in ((CHOKE, "%"), (LIFT, "m³/h"))
+    )
+    return (
+        f"What followed: at the end of that horizon the choke stands at {choke} and the lift at {lift}, with oil "
+        f"{style.signed(off[OIL], '.1f')} and gas {style.signed(off[GAS], '.0f')} m³/h off the setpoints."
+    )
 
 
-def _evolution(rows: np.ndarray, measured: xr.Dataset, moved: xr.Dataset, controller: str) -> None:
-    """CVs of the one, MVs and moves of the other stretch of time."""
-    colour = panels.run_colour(measured, controller)
-    for ax, cv in zip(rows[0], panels.cv_names(measured), strict=True):
-        panels.measured(ax, measured, controller, cv, MINUTE, "actual")
-    for ax, below, mv in zip(rows[1], rows[2], ("choke", "gas_lift"), strict=True):
-        panels.manipulated(ax, moved, controller, mv, MINUTE, legend=False)
-        move = moved.move.sel(controller=controller, mv=mv).values
-        t = np.append(moved.time.values, panels.span(moved)[1])
-        below.step(t / MINUTE, np.append(move, move[-1]), where="post", color=colour)
+def _off_setpoint(data: xr.Dataset, plan: StoredPlan, cv: dict[str, float]) -> dict[str, float]:
+    """CVs above the setpoints of the time of a plan."""
+    row = data.setpoint.isel(time=int(np.searchsorted(data.time.values, plan.time)))
+    return {name: value - float(row.sel(cv=name)) for name, value in cv.items()}
 
 
-@contextlib.contextmanager
-def _six_panels(
-    data: xr.Dataset, controller: str, at: float, plan: StoredPlan
-) -> Iterator[tuple[Figure, np.ndarray]]:
-    """Rates, inputs and moves, oil and choke on the left; setpoints and deadzones drawn."""
-    start, end = max(at - BEFORE, float(data.time.values[0])), at + _horizon(plan)
-    end = min(end, panels.span(data)[1])
-    shown = _between(data, start, end)
-    with style.grid(3, 2) as (drawn, rows):
-        for ax, cv in zip(rows[0], panels.cv_names(data), strict=True):
-            panels.deadzone_lines(ax, shown, controller, cv, MINUTE)
-            panels.setpoint(ax, shown, cv, MINUTE)
-        for ax, mv in zip(rows[2], ("choke", "gas_lift"), strict=True):
-            unit = style.unit(str(data.mv_unit.sel(mv=mv).item()))
-            ax.set_ylabel(f"{style.NAMES[mv]} move [{unit}]")
-            panels.time_axis(ax, start, end, bins=8)
-        for ax, mv in zip(rows[1], ("choke", "gas_lift"), strict=True):
-            ax.set_ylabel(style.label(mv, str(data.mv_unit.sel(mv=mv).item())))
-        yield drawn, rows
+def swing_caption(data: xr.Dataset, controller: str, which: int) -> str:
+    """What the oil rate was to do until the next turn, and what it did."""
+    moves = swing_moves(data, controller)
+    plan = plan_at(data, controller, moves[which])
+    until = moves[which + 1] if which < 2 else min(moves[2] + (moves[2] - moves[1]), plan.cv_time[-1])
+    k = int(np.searchsorted(data.time.values, min(until, data.time.values[-1])))
+    j = min(k - int(np.searchsorted(data.time.values, plan.time)), len(plan.cv))
+    run = data.sel(controller=controller).measurement.sel(cv=OIL).values
+    start = run[k - j]
+    expected, real = plan.cv[j - 1, index_of(data.cv, OIL)] - start, run[k] - start
+    return (
+        f"The controller turns the choke back by {style.signed(plan.move[0, index_of(data.mv, CHOKE)])} % and expects the "
+        f"oil rate to change by {style.signed(expected, '.1f')} m³/h in the next {j * plan.dt:.0f} s; it changes by "
+        f"{style.signed(real, '.1f')} m³/h."
+    )
 
 
-def _legend(drawn: Figure, rows: np.ndarray, title: str | None = None) -> None:
-    """One legend for all panels, on top of the figure."""
-    found = {}
-    for ax in rows.flat:
-        found |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
-    # the deadzone differs from CV to CV: said without its width
-    zones = [label for label in found if label.startswith("deadzone")]
-    shown = {label: found[label] for label in found if label not in zones}
-    if zones:
-        shown["deadzone"] = found[zones[0]]
-    drawn.legend(list(shown.values()), list(shown), loc="outside upper center", ncols=len(shown), title=title)
+_SIX = "Six plots over time: oil and gas rate, choke and gas lift, and the moves of both."
+ENTRIES = (
+    FigureEntry(
+        "25",
+        "plan of the mixed-integer MPC at a step of the setpoints",
+        "predictions",
+        "figure_25_plan",
+        planned,
+        planned_caption,
+        f"{_SIX} The past is white; the plan and its prediction lie on grey.",
+        (PREDICTED,),
+        {"controller": PREDICTED},
+    ),
+    FigureEntry(
+        "26",
+        "evolution after that step",
+        "predictions",
+        "figure_26_evolution",
+        evolved,
+        evolved_caption,
+        f"{_SIX} What happened, and the plan of the step dashed.",
+        (PREDICTED,),
+        {"controller": PREDICTED},
+    ),
+    *(
+        FigureEntry(
+            str(36 + which),
+            f"prediction and response at the {word} turn of an oscillation",
+            "without-soft",
+            f"figure_{36 + which}_prediction_{which + 1}",
+            swing,
+            swing_caption,
+            "Four plots over time: oil and gas rate with prediction and response, choke and lift with the plan.",
+            ("no-soft",),
+            {"controller": "no-soft", "which": which},
+        )
+        for which, word in enumerate(WORDS)
+    ),
+)

@@ -1,21 +1,19 @@
-"""Thesis figures 12 and 13: the nominal mixed-integer MPC against Soft MPC, and what each charges for a deviation."""
+"""Thesis figures 12 and 13: the nominal mixed-integer MPC against Soft MPC, and what each charges for a deviation (6.4)."""
 
 from __future__ import annotations
-
-import contextlib
-from collections.abc import Iterator
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
 from figures import panels, style
+from figures.figure import FigureEntry
+from figures.thesis.facts import reversals, times
 from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS
-from studies.definition.presets import GAS, OIL, TUNINGS
+from studies.definition.presets import CHOKE, GAS, OIL, TUNINGS
 
-CV_UNIT = dict(zip(CV_NAMES, CV_UNITS, strict=True))
 NOMINAL, SOFT = "nominal", "soft"
-CURVES = (  # preset, label, line
+PENALTIES = (  # preset, label, line
     ("no-soft", "nominal", "-"),
     ("no-soft-plain", "Soft MPC left out, weight unchanged", "-."),
     ("thesis", "Soft MPC", "-"),
@@ -23,59 +21,91 @@ CURVES = (  # preset, label, line
 REACH = 4.0  # deadzone half widths to show
 
 
-@contextlib.contextmanager
-def compared(data: xr.Dataset) -> Iterator[Figure]:
+def compared(data: xr.Dataset) -> Figure:
     """Figure 12: oil rate with setpoint and deadzone, and choke position, of both controllers.
 
     Args:
         data: results of the study ``soft``.
     """
-    with style.figure(2, row_height=2.5) as (drawn, (rate, choke)):
-        seconds = panels.time_axis(choke, *panels.span(data))
-        for name in (NOMINAL, SOFT):
-            label = "nominal" if name == NOMINAL else "Soft MPC"
-            panels.measured(rate, data, name, OIL, seconds, label)
-            panels.manipulated(choke, data, name, "choke", seconds, label=label)
-        panels.deadzone_lines(rate, data, SOFT, OIL, seconds)
-        panels.setpoint(rate, data, OIL, seconds)
-        panels.legend_above(rate, 4)
-        yield drawn
+    drawn, axes = style.figure(2, row_height=2.5)
+    seconds = panels.time_axis(axes[1], *panels.span(data))
+    for ax, channel in zip(axes, (OIL, CHOKE), strict=True):
+        curves = {NOMINAL: ("nominal", None), SOFT: ("Soft MPC", None)}
+        panels.compared(ax, data, channel, curves, seconds, zone=SOFT)
+    panels.legend_above(axes[0], 4)
+    return drawn
 
 
-@contextlib.contextmanager
-def penalties(_results=None) -> Iterator[Figure]:
+def compared_caption(data: xr.Dataset) -> str:
+    """How often each reverses the choke."""
+    return (
+        f"Without the deadzone the choke reverses {times(reversals(data, NOMINAL))} over the run, with Soft MPC "
+        f"{times(reversals(data, SOFT))}: a small constant deviation of the oil rate is cheap, another move is not."
+    )
+
+
+def penalties(_results=None) -> Figure:
     """Figure 13: penalty of one sample over the deviation, with the weights of the presets."""
-    with style.figure(2, row_height=2.6, sharex=False) as (drawn, axes):
-        for ax, cv in zip(axes, (OIL, GAS), strict=True):
-            half = TUNINGS["thesis"]["deadzone"][cv]
-            deviation = np.linspace(-REACH * half, REACH * half, 401)
-            for preset, label, line in CURVES:
-                colour = style.TUNING_COLOURS.get(preset, style.CONTROLLER_COLOURS["mixed-integer", "step"])
-                ax.plot(deviation, penalty(preset, cv, deviation), line, color=colour, label=label)
-            zone = f"deadzone ±{half:g} {style.unit(CV_UNIT[cv])}"
-            ax.axvspan(-half, half, color=style.BAND, linewidth=0, label=zone)
-            ax.set_xlim(deviation[0], deviation[-1])
-            ax.set_ylim(bottom=0)
-            name = style.NAMES[cv]
-            ax.set_xlabel(f"{name}: deviation from the setpoint [{style.unit(CV_UNIT[cv])}]")
-            ax.set_ylabel("penalty of a sample [1]")
-        axes[0].legend(loc="upper center", ncols=1)
-        axes[1].legend(loc="upper center", ncols=1)
-        yield drawn
+    drawn, axes = style.figure(2, row_height=2.6, sharex=False)
+    for ax, cv in zip(axes, (OIL, GAS), strict=True):
+        unit = style.unit(CV_UNITS[CV_NAMES.index(cv)])
+        half = TUNINGS["thesis"]["deadzone"][cv]
+        deviation = np.linspace(-REACH * half, REACH * half, 401)
+        for preset, label, line in PENALTIES:
+            colour = style.TUNING_COLOURS.get(preset, style.CONTROLLER_COLOURS["mixed-integer", "step"])
+            ax.plot(deviation, penalty(preset, cv, deviation), line, color=colour, label=label)
+        ax.axvspan(-half, half, color=style.BAND, linewidth=0, label=f"deadzone ±{half:g} {unit}")
+        ax.set_xlim(deviation[0], deviation[-1])
+        ax.set_ylim(bottom=0)
+        ax.set_xlabel(f"{style.name_of(cv)}: deviation from the setpoint [{unit}]")
+        ax.set_ylabel("penalty of a sample [1]")
+        ax.legend(loc="upper center")
+    return drawn
 
 
 def penalty(preset: str, cv: str, deviation: np.ndarray) -> np.ndarray:
-    """What one sample costs in (6.6): Q d^2 + S eta^2 + s eta with eta = max(|d| - c, 0).
+    """What one sample costs with a preset of `studies.definition.presets.TUNINGS`; deviation in CV units."""
+    fields = ("cv_weight", "soft_quadratic", "soft_linear", "deadzone")
+    return cost(deviation, *(TUNINGS[preset][field][cv] for field in fields))
 
-    Args:
-        preset: a key of `studies.definition.presets.TUNINGS`.
-        cv: name of the CV.
-        deviation: predicted CV minus setpoint [CV unit].
-    """
-    tuning = TUNINGS[preset]
-    eta = np.maximum(np.abs(deviation) - tuning["deadzone"][cv], 0.0)
+
+def cost(
+    deviation: np.ndarray, weight: float, quadratic: float, linear: float, deadzone: float
+) -> np.ndarray:
+    """What the deviation of one sample costs in (6.6): Q d^2 + S eta^2 + s eta with eta = max(|d| - c, 0)."""
+    eta = np.maximum(np.abs(deviation) - deadzone, 0.0)
+    return weight * deviation**2 + quadratic * eta**2 + linear * eta
+
+
+def penalties_caption(_results=None) -> str:
+    """The ratio of both inside and far outside the deadzone."""
+    half = TUNINGS["thesis"]["deadzone"][OIL]
+    at = np.array([half, 10 * half])
+    inside, outside = 100 * penalty("thesis", OIL, at) / penalty("no-soft", OIL, at)
     return (
-        tuning["cv_weight"][cv] * deviation**2
-        + tuning["soft_quadratic"][cv] * eta**2
-        + tuning["soft_linear"][cv] * eta
+        f"The penalty of one sample with the weights of our presets: inside the deadzone Soft MPC charges {inside:.0f} % of "
+        f"the nominal controller, at ten times its half width {outside:.0f} %."
     )
+
+
+ENTRIES = (
+    FigureEntry(
+        "12",
+        "nominal and Soft mixed-integer MPC",
+        "soft",
+        "figure_12_nominal_and_soft",
+        compared,
+        compared_caption,
+        "Oil rate with setpoint and deadzone above the choke position, each with a curve per controller.",
+        (NOMINAL, SOFT),
+    ),
+    FigureEntry(
+        "13",
+        "penalty of a deviation: Soft MPC and nominal",
+        None,
+        "figure_13_penalties",
+        penalties,
+        penalties_caption,
+        "Two plots, oil above gas: three parabola-like penalties over the deviation, the deadzone shaded.",
+    ),
+)

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
-
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
 from figures import panels, style
 from figures.benchmark import two_digits
-from figures.entry import FigureEntry
-from figures.thesis.thesis_captions import compiled_note
+from figures.figure import FigureEntry
+from figures.thesis.facts import time_note
 from studies.definition.presets import CHOKE, OIL
 
 BLOCKS, SINGLE = "blocks", "no-blocks"
@@ -25,41 +22,36 @@ TIMED = {  # name: label, colour
 MILLISECONDS = 1e3  # of a second
 
 
-@contextlib.contextmanager
-def draw(data: xr.Dataset) -> Iterator[Figure]:
+def draw(data: xr.Dataset) -> Figure:
     """Oil rate and choke of the continuous controllers; time of every step of all that have run.
 
     Args:
         data: results of the study ``unblocked``.
     """
-    with style.figure(3, row_height=2.1) as (drawn, (rate, choke, times)):
-        seconds = panels.time_axis(times, *panels.span(data))
-        panels.deadzone_lines(rate, data, BLOCKS, OIL, seconds)
-        for name in (BLOCKS, SINGLE):
-            label, colour = TIMED[name]
-            panels.measured(rate, data, name, OIL, seconds, label, colour)
-            panels.manipulated(choke, data, name, CHOKE, seconds, legend=False, label=label, colour=colour)
-        for ax in (rate, choke):
-            ax.lines[-1].set_linestyle((0, (4, 3)))  # both curves of a pair are seen where they are one
-        panels.setpoint(rate, data, OIL, seconds)
-        panels.legend_above(rate, 4)
-        for name in _timed(data):
-            label, colour = TIMED[name]
-            milliseconds = MILLISECONDS * data.solve_time.sel(controller=name).values
-            times.plot(data.time.values / seconds, milliseconds, ".", markersize=3, color=colour, label=label)
-        times.set_yscale("log")
-        times.set_ylabel("time per sample [ms]")
-        panels.legend_above(times, 2)
-        yield drawn
+    drawn, (rate, choke, times) = style.figure(3, row_height=2.1)
+    seconds = panels.time_axis(times, *panels.span(data))
+    for ax, channel in ((rate, OIL), (choke, CHOKE)):
+        panels.compared(ax, data, channel, {name: TIMED[name] for name in (BLOCKS, SINGLE)}, seconds, BLOCKS)
+        second = next(line for line in ax.lines if line.get_label() == TIMED[SINGLE][0])
+        second.set_linestyle((0, (4, 3)))  # both curves of a pair are seen where they are one
+    panels.legend_above(rate, 4)
+    for name in _timed(data):
+        label, colour = TIMED[name]
+        milliseconds = MILLISECONDS * data.solve_time.sel(controller=name).values
+        times.plot(data.time.values / seconds, milliseconds, ".", markersize=3, color=colour, label=label)
+    times.set_yscale("log")
+    times.set_ylabel("time per sample [ms]")
+    panels.legend_above(times, 2)
+    return drawn
 
 
 def _timed(data: xr.Dataset) -> list[str]:
-    return [
-        name for name in TIMED if name in data.controller.values and data.complete.sel(controller=name) == 1
-    ]
+    finished = data.controller.values[data.complete.values == 1]
+    return [name for name in TIMED if name in finished]
 
 
-def _caption(data: xr.Dataset) -> str:
+def caption(data: xr.Dataset) -> str:
+    """How far the responses are apart, and the median times."""
     pair = data.measurement.sel(controller=[BLOCKS, SINGLE])
     half = data.tuning_deadzone.sel(controller=BLOCKS)
     apart = float((np.abs(pair[0] - pair[1]) / half).max())
@@ -69,17 +61,19 @@ def _caption(data: xr.Dataset) -> str:
     )
     return (
         f"With 16 blocks and with 200 single moves the rates are at most {apart:.2g} half widths of the deadzone apart. "
-        f"Median time of one step: {medians}.{compiled_note(data, _timed(data))}"
+        f"Median time of one step: {medians}.{time_note(data, _timed(data))}"
     )
 
 
-ENTRY = FigureEntry(
-    "blocking",
-    "what move blocking changes, and what it saves",
-    "unblocked",
-    "blocking",
-    draw,
-    (BLOCKS, SINGLE),
-    caption=_caption,
-    alt="Three plots over time: oil rate and choke position of two controllers, and time per sample of each controller.",
+ENTRIES = (
+    FigureEntry(
+        "blocking",
+        "what move blocking changes, and what it saves",
+        "unblocked",
+        "blocking",
+        draw,
+        caption,
+        "Three plots over time: oil rate and choke position of two controllers, and time per sample of each controller.",
+        (BLOCKS, SINGLE),
+    ),
 )

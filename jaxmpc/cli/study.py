@@ -82,12 +82,12 @@ def _study_comparison(options: Options) -> int:
         folder = run_rto(*asked)
         draw_rto(folder)
     else:
-        from figures.thesis.comparison import draw_all
+        from figures.registry import draw_study
         from studies.thesis.catalogue import run_named
         from studies.thesis.report import write_summary
 
         folder = run_named(options.study, *asked)
-        draw_all(folder, options.study)
+        draw_study(folder, options.study)
         write_summary(folder, options.study)
     print(f"Summary: {folder / 'summary.md'}, figures: {folder / 'figures'}")
     return EXIT_OPTIMAL
@@ -214,7 +214,7 @@ def simulate(options: Options) -> int:
         print(f"jaxmpc: {warning.message}", file=sys.stderr)
     folder = options.out / f"{Path(store).stem}-{int(number)}"
     print(again.save(folder))
-    from figures.sweep.draw import draw_run
+    from figures.closed_loop import draw_run
 
     look = {"kind": again.kind, "actuator": again.actuator}
     for path in draw_run(again.trajectory, again.deadzone, folder, again.title, **look):

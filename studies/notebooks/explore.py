@@ -332,14 +332,12 @@ def _(InputError, again, compilation_shown, draw, mo, page, path, picked):
             if again.value:
                 from pathlib import Path
 
-                from figures.sweep.draw import run_results
-                from studies.notebooks.loop import RUN
+                from figures.closed_loop import of_trajectory
                 from studies.run.rerun import rerun
 
                 with compilation_shown(), mo.status.spinner("running"):
                     found = rerun(Path(store), number)
-                data = run_results(found.trajectory, found.deadzone, found.kind, found.actuator)
-                data = data.assign_coords(controller=[RUN])
+                data = of_trajectory(found.trajectory, found.deadzone, found.kind, found.actuator)
             else:
                 data = draw.stored(store, number)
         except InputError as error:

@@ -317,7 +317,7 @@ def test_the_thesis_study_gets_its_options_and_bad_ones_are_reported(stub, tmp_p
         "studies.thesis.catalogue",
         run_named=lambda *options: given.append(options) or tmp_path / "r" / "thesis",
     )
-    stub("figures.thesis.comparison", draw_all=lambda *options: given.append(options))
+    stub("figures.registry", draw_study=lambda *options: given.append(options))
     stub("studies.thesis.report", write_summary=lambda *options: given.append(options))
     assert main(["study", "run", "thesis", "--out", str(tmp_path / "r"), "--quick", "--plant", "jax"]) == 0
     assert given == [("thesis", tmp_path / "r", True, "jax"), *2 * [(tmp_path / "r" / "thesis", "thesis")]]

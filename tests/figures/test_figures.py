@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from figures import panels, registry, style
-from figures.thesis import closeup, comparison, tracking
+from figures.thesis import runs
 from jaxmpc.errors import InputError
 from studies.store.comparison import ResultStore, open_results
 from tests import studies_synthetic as made
@@ -22,7 +22,7 @@ def results(tmp_path_factory):
 
 
 def test_every_thesis_figure_is_drawn_as_png_and_pdf(results):
-    paths = comparison.draw_all(results, "thesis")
+    paths = registry.draw_study(results, "thesis")
     names = {path.name for path in paths}
     for number in [10, 11, *range(14, 25)]:
         for kind in ("png", "pdf"):
@@ -56,17 +56,17 @@ def test_a_figure_of_a_run_that_is_not_finished_is_refused(tmp_path):
 
 def test_a_controller_has_one_colour_and_the_setpoint_is_dashed(results):
     data = open_results(results)
-    for panel in (tracking.rates, tracking.inputs, tracking.bias):
+    for panel in (runs.rates, runs.inputs, runs.bias):
         for name in made.RUNS:
-            with panel(data, name) as drawn:
-                for axes in drawn.axes:
-                    assert "[" in axes.get_ylabel()
-                    assert any(line.get_color() == panels.run_colour(data, name) for line in axes.lines)
-                assert "[" in drawn.axes[-1].get_xlabel()
-    with tracking.rates(data, "step-choke") as drawn:
-        setpoint = [line for line in drawn.axes[0].lines if line.get_label() == "setpoint"]
-        assert [line.get_linestyle() for line in setpoint] == ["--"]
-        assert drawn.axes[0].collections  # the deadzone
+            drawn = panel(data, name)
+            for axes in drawn.axes:
+                assert "[" in axes.get_ylabel()
+                assert any(line.get_color() == panels.run_colour(data, name) for line in axes.lines)
+            assert "[" in drawn.axes[-1].get_xlabel()
+    drawn = runs.rates(data, "step-choke")
+    setpoint = [line for line in drawn.axes[0].lines if line.get_label() == "setpoint"]
+    assert [line.get_linestyle() for line in setpoint] == ["--"]
+    assert drawn.axes[0].collections  # the deadzone
     assert len({panels.run_colour(data, name) for name in made.RUNS}) == 3
 
 
@@ -75,34 +75,33 @@ def test_there_is_no_band_without_soft_mpc(results):
     hard = data.assign(
         tuning_soft_quadratic=0 * data.tuning_soft_quadratic, tuning_soft_linear=0 * data.tuning_soft_linear
     )
-    with tracking.rates(hard, "step-choke") as drawn:
-        assert not drawn.axes[0].collections
+    assert not runs.rates(hard, "step-choke").axes[0].collections
 
 
 def test_the_close_up_is_the_window_with_most_reversals_below_half_open(results):
     data = open_results(results).load()
-    start, end = closeup.oscillating_stretch(data, "step-choke")
+    start, end = runs.oscillating_stretch(data, "step-choke")
     assert (
         1000.0 <= start < end <= 2000.0
     )  # the second half of the first window hunts as much as the last: first wins
     late = data.assign(position=data.position.copy(deep=True))
     in_first = data.time.values < 2000
     late.position.loc[{"time": data.time[in_first], "mv": "choke"}] = 40.0
-    start, end = closeup.oscillating_stretch(late, "step-choke")
+    start, end = runs.oscillating_stretch(late, "step-choke")
     assert 3000.0 <= start < end <= 4000.0
 
 
 def test_a_close_up_of_a_quiet_run_is_refused(results):
     with pytest.raises(InputError, match="reverses below"):
-        closeup.oscillating_stretch(open_results(results), "mixed-integer")
+        runs.oscillating_stretch(open_results(results), "mixed-integer")
 
 
-def test_figures_are_closed_after_use():
+def test_figures_need_not_be_closed():
     import matplotlib.pyplot as plt
 
     before = plt.get_fignums()
-    with style.figure(2) as (_, axes):
-        assert len(axes) == 2
+    _, axes = style.figure(2)
+    assert len(axes) == 2
     assert plt.get_fignums() == before
 
 

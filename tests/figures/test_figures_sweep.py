@@ -6,7 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from figures import style
+from figures import closed_loop, style
 from figures.sweep import draw as sweep
 from figures.sweep import fan, maps, regret, wear
 from figures.sweep.data import load, sweep_axes, thesis_tuning, variants
@@ -147,11 +147,11 @@ def test_missing_scenarios_are_counted_in_every_figure_and_not_drawn(tmp_path):
     pages = sweep.pages(data)
     assert set(pages) == {"pareto", "fan", "distributions"}
     for page in pages.values():
-        with page() as drawn:
-            assert "4 of 24 scenarios are missing" in caption(drawn)
+        drawn = page()
+        assert "4 of 24 scenarios are missing" in caption(drawn)
     whole = load(monte_carlo(tmp_path / "b.zarr"))
-    with sweep.pages(whole)["pareto"]() as drawn:
-        assert "missing" not in caption(drawn)
+    drawn = sweep.pages(whole)["pareto"]()
+    assert "missing" not in caption(drawn)
 
 
 # ------------------------------------------------------------------------------------------------ the front
@@ -186,7 +186,7 @@ def test_equal_points_share_the_front_and_a_tie_in_one_is_beaten():
 
 def test_the_points_and_the_front_are_the_stored_numbers(deadzone):
     data = open_study(deadzone)
-    axes = sweep.pareto(data)
+    axes = wear.pareto(data)
     x = data.choke_travel.values
     y = (data.mean_absolute_deviation.values / (1000.0, 5.0)).mean(1)
     drawn = np.concatenate([np.asarray(points.get_offsets()) for points in axes.collections])
@@ -203,7 +203,7 @@ def test_the_points_and_the_front_are_the_stored_numbers(deadzone):
 
 def test_one_cv_and_another_colour_can_be_chosen(deadzone):
     data = open_study(deadzone)
-    axes = sweep.pareto(data, color="tuning.move_weight.choke", cv="oil_rate")
+    axes = wear.pareto(data, color="tuning.move_weight.choke", cv="oil_rate")
     drawn = np.concatenate([np.asarray(points.get_offsets())[:, 1] for points in axes.collections])
     np.testing.assert_allclose(np.sort(drawn), np.sort(data.mean_absolute_deviation.sel(cv="oil_rate")))
     assert "[m³/h]" in axes.get_ylabel()
@@ -211,7 +211,7 @@ def test_one_cv_and_another_colour_can_be_chosen(deadzone):
     assert set(colours) == {62.5, 250, 1000}
     for wrong in ({"color": "nothing"}, {"cv": "water"}, {"x": "nothing"}):
         with pytest.raises(InputError, match=next(iter(wrong.values()))):
-            sweep.pareto(data, **wrong)
+            wear.pareto(data, **wrong)
 
 
 # ------------------------------------------------------------------------------------------------ the thesis
@@ -224,11 +224,11 @@ def test_the_thesis_tuning_is_marked_where_it_is(deadzone):
     assert data["tuning.deadzone.gas_rate"].values[7] == 1000
     assert data["tuning.move_weight.choke"].values[7] == 250
     y = (data.mean_absolute_deviation.values[7] / (1000.0, 5.0)).mean()
-    assert ring_points(sweep.pareto(data)) == {(float(data.choke_travel.values[7]), y)}
-    with sweep.pages(data)["maps"]() as drawn:
-        assert "tuning of the thesis" in caption(drawn)
-        frame = drawn.axes[0].patches[-1]
-        assert frame.get_y() < 250 < frame.get_y() + frame.get_height()
+    assert ring_points(wear.pareto(data)) == {(float(data.choke_travel.values[7]), y)}
+    drawn = sweep.pages(data)["maps"]()
+    assert "tuning of the thesis" in caption(drawn)
+    frame = drawn.axes[0].patches[-1]
+    assert frame.get_y() < 250 < frame.get_y() + frame.get_height()
 
 
 @pytest.mark.parametrize(
@@ -245,10 +245,10 @@ def test_another_tuning_is_not_marked(tmp_path, oil, weights, definition):
     keys = (DEADZONE, OIL_DEADZONE, WEIGHT)
     data = load(write(tmp_path / "a.zarr", keys, values, numbers(4), definition=definition))
     assert not thesis_tuning(data).any()
-    assert ring_points(sweep.pareto(data)) == set()
-    with sweep.pages(data)["maps"]() as drawn:
-        assert "tuning of the thesis" not in caption(drawn)
-        assert not drawn.axes[0].patches
+    assert ring_points(wear.pareto(data)) == set()
+    drawn = sweep.pages(data)["maps"]()
+    assert "tuning of the thesis" not in caption(drawn)
+    assert not drawn.axes[0].patches
 
 
 def test_a_study_of_the_weight_alone_is_marked_only_if_its_base_has_the_thesis_deadzone(tmp_path):
@@ -271,28 +271,28 @@ def test_wells_that_differ_have_no_thesis_mark(tmp_path):
 
 def test_maps_show_the_stored_numbers_on_log_axes_where_values_are_log_spaced(deadzone):
     data = load(deadzone)
-    with sweep.pages(data)["maps"]() as drawn:
-        panels = [ax for ax in drawn.axes if ax.collections and ax.get_title(loc="left")]
-        assert len(panels) == 4
-        travel = np.asarray(panels[0].collections[0].get_array())
-        np.testing.assert_array_equal(travel, data.choke_travel.values.reshape(4, 3).T)
-        oil = np.asarray(panels[3].collections[0].get_array())
-        np.testing.assert_array_equal(oil, data.mean_absolute_deviation.values[:, 1].reshape(4, 3).T)
-        assert panels[0].get_yscale() == "log"
-        assert panels[0].get_xscale() == "linear"
-        assert all("[" in ax.get_title(loc="left") for ax in panels)
-        assert "[m³/h]" in panels[3].get_xlabel()
-        assert "[1/%²]" in panels[0].get_ylabel()
+    drawn = sweep.pages(data)["maps"]()
+    panels = [ax for ax in drawn.axes if ax.collections and ax.get_title(loc="left")]
+    assert len(panels) == 4
+    travel = np.asarray(panels[0].collections[0].get_array())
+    np.testing.assert_array_equal(travel, data.choke_travel.values.reshape(4, 3).T)
+    oil = np.asarray(panels[3].collections[0].get_array())
+    np.testing.assert_array_equal(oil, data.mean_absolute_deviation.values[:, 1].reshape(4, 3).T)
+    assert panels[0].get_yscale() == "log"
+    assert panels[0].get_xscale() == "linear"
+    assert all("[" in ax.get_title(loc="left") for ax in panels)
+    assert "[m³/h]" in panels[3].get_xlabel()
+    assert "[1/%²]" in panels[0].get_ylabel()
 
 
 def test_cells_are_medians_over_further_axes_and_the_caption_says_so(tmp_path):
     values = grid([500, 1000], [62.5, 250], [1, 2, 3])
     figures = numbers(12)
     data = load(write(tmp_path / "a.zarr", (DEADZONE, WEIGHT, SEED), values, figures))
-    with sweep.pages(data)["maps"]() as drawn:
-        table = np.asarray(drawn.axes[0].collections[0].get_array())
-        np.testing.assert_allclose(table, np.median(figures["choke_travel"].reshape(2, 2, 3), axis=2).T)
-        assert "Median over seed of the noise" in caption(drawn)
+    drawn = sweep.pages(data)["maps"]()
+    table = np.asarray(drawn.axes[0].collections[0].get_array())
+    np.testing.assert_allclose(table, np.median(figures["choke_travel"].reshape(2, 2, 3), axis=2).T)
+    assert "Median over seed of the noise" in caption(drawn)
 
 
 def test_a_cell_without_a_scenario_stays_empty():
@@ -312,17 +312,17 @@ def test_the_matrix_of_models_has_every_region_and_controller(tmp_path):
     figures = numbers(24)
     keys = (CONTROLLER, ACTUATOR, REFERENCE, CHOKE, LIFT)
     data = load(write(tmp_path / "a.zarr", keys, values, figures))
-    with sweep.pages(data)["mismatch"]() as drawn:
-        panels = [ax for ax in drawn.axes if ax.get_title(loc="left").strip()]
-        assert [ax.get_title(loc="left") for ax in panels] == [
-            "continuous MPC, continuous choke",
-            "mixed-integer MPC, step choke",
-        ]
-        scaled = (figures["mean_absolute_deviation"] / (1000.0, 5.0)).mean(1).reshape(2, 2, 3, 2)
-        for ax, expected in zip(panels, scaled, strict=True):
-            table = np.asarray(ax.collections[0].get_array())  # rows: region, in it the lift
-            np.testing.assert_allclose(table, expected.transpose(0, 2, 1).reshape(4, 3))
-            assert {text.get_text() for text in ax.texts} >= {"wide-open", "nearly-closed"}
+    drawn = sweep.pages(data)["mismatch"]()
+    panels = [ax for ax in drawn.axes if ax.get_title(loc="left").strip()]
+    assert [ax.get_title(loc="left") for ax in panels] == [
+        "continuous MPC, continuous choke",
+        "mixed-integer MPC, step choke",
+    ]
+    scaled = (figures["mean_absolute_deviation"] / (1000.0, 5.0)).mean(1).reshape(2, 2, 3, 2)
+    for ax, expected in zip(panels, scaled, strict=True):
+        table = np.asarray(ax.collections[0].get_array())  # rows: region, in it the lift
+        np.testing.assert_allclose(table, expected.transpose(0, 2, 1).reshape(4, 3))
+        assert {text.get_text() for text in ax.texts} >= {"wide-open", "nearly-closed"}
 
 
 # ------------------------------------------------------------------------------------------------ blocking
@@ -374,33 +374,33 @@ def test_regret_is_against_the_best_where_the_thesis_blocking_is_not_in_the_stud
 
 def test_points_of_blocking_are_medians_with_quartiles_and_the_mode_is_the_marker(tmp_path):
     data = blocking_store(tmp_path / "a.zarr", cost=doubled)
-    with sweep.pages(data)["blocking"]() as drawn:
-        first, second, third = drawn.axes
-        shown = {}
-        for bars in first.containers:
-            line = bars.lines[0]
-            shown[(float(line.get_xdata()[0]), float(line.get_ydata()[0]))] = line.get_marker()
-        times = 1e3 * data.solve_time_median.values.reshape(4, 6)
-        for k, row in enumerate(times):
-            near = min(shown, key=lambda point, at=row: abs(point[0] - np.median(at)))
-            np.testing.assert_allclose(near, (np.median(row), (0.0, 10.0, 0.0, 10.0)[k]), atol=1e-9)
-            assert shown[near] == ("o" if k < 2 else "s")
-        assert sorted(float(bars.lines[0].get_xdata()[0]) for bars in third.containers) == [6, 6, 32, 32]
-        assert all("[" in ax.get_xlabel() for ax in (first, second, third))
-        assert "[%]" in first.get_ylabel()
+    drawn = sweep.pages(data)["blocking"]()
+    first, second, third = drawn.axes
+    shown = {}
+    for bars in first.containers:
+        line = bars.lines[0]
+        shown[(float(line.get_xdata()[0]), float(line.get_ydata()[0]))] = line.get_marker()
+    times = 1e3 * data.solve_time_median.values.reshape(4, 6)
+    for k, row in enumerate(times):
+        near = min(shown, key=lambda point, at=row: abs(point[0] - np.median(at)))
+        np.testing.assert_allclose(near, (np.median(row), (0.0, 10.0, 0.0, 10.0)[k]), atol=1e-9)
+        assert shown[near] == ("o" if k < 2 else "s")
+    assert sorted(float(bars.lines[0].get_xdata()[0]) for bars in third.containers) == [6, 6, 32, 32]
+    assert all("[" in ax.get_xlabel() for ax in (first, second, third))
+    assert "[%]" in first.get_ylabel()
     np.testing.assert_allclose(regret.quartiles(np.array([1.0, 2, 3, 4, 5, np.nan])), [2, 3, 4])
 
 
 def test_labels_of_blocking_do_not_overlap(tmp_path):
     lengths = [" ".join(["1"] * n) for n in (3, 4, 5, 6, 7, 8)]
     data = blocking_store(tmp_path / "a.zarr", blocks=[(b, 120) for b in lengths])
-    with sweep.pages(data)["blocking"]() as drawn:
-        renderer = drawn.canvas.get_renderer()
-        for ax in drawn.axes:
-            boxes = [text.get_window_extent(renderer) for text in ax.texts]
-            assert len(boxes) == 12
-            for i, one in enumerate(boxes):
-                assert not any(one.shrunk(0.95, 0.8).overlaps(other.shrunk(0.95, 0.8)) for other in boxes[:i])
+    drawn = sweep.pages(data)["blocking"]()
+    renderer = drawn.canvas.get_renderer()
+    for ax in drawn.axes:
+        boxes = [text.get_window_extent(renderer) for text in ax.texts]
+        assert len(boxes) == 12
+        for i, one in enumerate(boxes):
+            assert not any(one.shrunk(0.95, 0.8).overlaps(other.shrunk(0.95, 0.8)) for other in boxes[:i])
 
 
 # ------------------------------------------------------------------------------------------------ Monte Carlo
@@ -408,23 +408,23 @@ def test_labels_of_blocking_do_not_overlap(tmp_path):
 
 def test_fans_are_quantiles_of_the_stored_runs_in_the_colour_of_the_controller(tmp_path):
     data = load(monte_carlo(tmp_path / "a.zarr"))
-    with sweep.pages(data)["fan"]() as drawn:
-        grid_ = np.array(drawn.axes).reshape(3, 2)
-        for j, colour in enumerate((style.VERMILLION, style.GREEN)):
-            rows = slice(12 * j, 12 * j + 12)
-            oil = data.measurement.values[rows, :, 1]
-            lines = {line.get_label(): line for line in grid_[0, j].lines}
-            np.testing.assert_allclose(lines["median"].get_ydata(), np.median(oil, axis=0))
-            assert lines["median"].get_color() == colour
-            np.testing.assert_allclose(lines["setpoint"].get_ydata(), data.setpoint.values[0, :, 1])
-            assert lines["setpoint"].get_linestyle() == "--"
-            wide = grid_[0, j].collections[0].get_paths()[0].vertices[:, 1]
-            low, high = np.percentile(oil, [5, 95], axis=0)
-            np.testing.assert_allclose([wide.min(), wide.max()], [low.min(), high.max()])
-            choke = next(line for line in grid_[2, j].lines if line.get_label() == "median")
-            np.testing.assert_allclose(choke.get_ydata(), np.median(data.position.values[rows, :, 0], axis=0))
-        assert all("[" in ax.get_ylabel() for ax in grid_[:, 0])
-        assert all("[min]" in ax.get_xlabel() for ax in grid_[-1])
+    drawn = sweep.pages(data)["fan"]()
+    grid_ = np.array(drawn.axes).reshape(3, 2)
+    for j, colour in enumerate((style.VERMILLION, style.GREEN)):
+        rows = slice(12 * j, 12 * j + 12)
+        oil = data.measurement.values[rows, :, 1]
+        lines = {line.get_label(): line for line in grid_[0, j].lines}
+        np.testing.assert_allclose(lines["median"].get_ydata(), np.median(oil, axis=0))
+        assert lines["median"].get_color() == colour
+        np.testing.assert_allclose(lines["setpoint"].get_ydata(), data.setpoint.values[0, :, 1])
+        assert lines["setpoint"].get_linestyle() == "--"
+        wide = grid_[0, j].collections[0].get_paths()[0].vertices[:, 1]
+        low, high = np.percentile(oil, [5, 95], axis=0)
+        np.testing.assert_allclose([wide.min(), wide.max()], [low.min(), high.max()])
+        choke = next(line for line in grid_[2, j].lines if line.get_label() == "median")
+        np.testing.assert_allclose(choke.get_ydata(), np.median(data.position.values[rows, :, 0], axis=0))
+    assert all("[" in ax.get_ylabel() for ax in grid_[:, 0])
+    assert all("[min]" in ax.get_xlabel() for ax in grid_[-1])
 
 
 def test_times_that_some_runs_do_not_reach_are_drawn_from_the_others():
@@ -438,18 +438,18 @@ def test_times_that_some_runs_do_not_reach_are_drawn_from_the_others():
 def test_distributions_are_sorted_and_name_the_worst_run_with_its_command(tmp_path):
     store = monte_carlo(tmp_path / "a.zarr")
     data = load(store)
-    with sweep.pages(data)["distributions"]() as drawn:
-        first = drawn.axes[0]
-        for j, colour in enumerate((style.VERMILLION, style.GREEN)):
-            travel = data.choke_travel.values[12 * j : 12 * j + 12]
-            line = next(ln for ln in first.lines if ln.get_color() == colour and len(ln.get_xdata()) > 1)
-            np.testing.assert_array_equal(line.get_xdata()[1:], np.sort(travel))
-            np.testing.assert_allclose(line.get_ydata()[[0, -1]], [0, 100])
-            worst = 12 * j + int(np.argmax(travel))
-            assert f"worst: #{worst}" in [text.get_text() for text in first.texts]
-        assert f"jaxmpc simulate '{fan.shown_store(data)}#" in caption(drawn)
-        assert fan.shown_store(data).endswith("a.zarr")
-        assert all("[" in ax.get_xlabel() for ax in drawn.axes)
+    drawn = sweep.pages(data)["distributions"]()
+    first = drawn.axes[0]
+    for j, colour in enumerate((style.VERMILLION, style.GREEN)):
+        travel = data.choke_travel.values[12 * j : 12 * j + 12]
+        line = next(ln for ln in first.lines if ln.get_color() == colour and len(ln.get_xdata()) > 1)
+        np.testing.assert_array_equal(line.get_xdata()[1:], np.sort(travel))
+        np.testing.assert_allclose(line.get_ydata()[[0, -1]], [0, 100])
+        worst = 12 * j + int(np.argmax(travel))
+        assert f"worst: #{worst}" in [text.get_text() for text in first.texts]
+    assert f"jaxmpc simulate '{fan.shown_store(data)}#" in caption(drawn)
+    assert fan.shown_store(data).endswith("a.zarr")
+    assert all("[" in ax.get_xlabel() for ax in drawn.axes)
 
 
 def test_a_run_without_finite_numbers_is_the_worst_and_lowers_the_share():
@@ -489,17 +489,17 @@ def test_columns_that_move_together_are_one_axis(deadzone, tmp_path):
 
 def test_one_run_is_drawn_with_its_deadzone_choke_and_lift(tmp_path):
     run = made.trajectory("hunting")
-    paths = sweep.draw_run(run, (1000.0, 5.0), tmp_path, "Scenario 3", kind="continuous")
+    paths = closed_loop.draw_run(run, (1000.0, 5.0), tmp_path, "Scenario 3", kind="continuous")
     assert {path.name for path in paths} == {"run.png", "run.pdf"}
-    with sweep.run(sweep.run_results(run, (1000.0, 0.0), "continuous", "step"), "Scenario 3") as drawn:
-        oil, gas, choke, lift = drawn.axes
-        assert gas.collections
-        assert not oil.collections
-        lines = {line.get_label(): line for line in gas.lines}
-        np.testing.assert_array_equal(lines["measured"].get_ydata(), run.cv[:, 0])
-        assert lines["measured"].get_color() == style.VERMILLION
-        np.testing.assert_array_equal(choke.lines[1].get_ydata()[:-1], run.mv[:, 0])
-        np.testing.assert_array_equal(lift.lines[0].get_ydata()[:-1], run.mv[:, 1])
-        assert all("[" in ax.get_ylabel() for ax in drawn.axes)
-        assert "[" in lift.get_xlabel()
-        assert drawn.get_suptitle() == "Scenario 3"
+    drawn = closed_loop.run(closed_loop.of_trajectory(run, (1000.0, 0.0), "continuous", "step"), "Scenario 3")
+    oil, gas, choke, lift = drawn.axes
+    assert gas.collections
+    assert not oil.collections
+    lines = {line.get_label(): line for line in gas.lines}
+    np.testing.assert_array_equal(lines["measured"].get_ydata(), run.cv[:, 0])
+    assert lines["measured"].get_color() == style.VERMILLION
+    np.testing.assert_array_equal(choke.lines[1].get_ydata()[:-1], run.mv[:, 0])
+    np.testing.assert_array_equal(lift.lines[0].get_ydata()[:-1], run.mv[:, 1])
+    assert all("[" in ax.get_ylabel() for ax in drawn.axes)
+    assert "[" in lift.get_xlabel()
+    assert drawn.get_suptitle() == "Scenario 3"

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from figures.thesis.extensions import ENTRIES
+from figures.registry import FIGURES
 from identify.schedule import both_ways, identify_schedule
 from identify.step_test import identify_step_response
 from jaxmpc import status
@@ -33,7 +33,7 @@ def test_every_study_has_controllers_that_can_be_built(name, quick):
     definition = catalogue.STUDIES[name](quick, "jax")
     definition.check()
     assert definition.name == f"{name}-{'quick-' if quick else ''}jax"
-    for entry in ENTRIES:
+    for entry in FIGURES.values():
         if entry.study == name:
             assert set(entry.needs) <= {controller.name for controller in definition.controllers}
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from figures.registry import FIGURES
-from figures.thesis import comparison
+from figures.registry import FIGURES, draw_study
 from studies.kpi import evaluate
 from studies.store.comparison import open_results
 from studies.thesis import claims
@@ -50,7 +49,7 @@ def test_the_quick_study_shows_what_the_thesis_shows(quick):
 @pytest.mark.slow
 def test_every_figure_is_drawn_and_a_rerun_computes_nothing(quick):
     folder, _ = quick
-    paths = comparison.draw_all(folder, "thesis")
+    paths = draw_study(folder, "thesis")
     assert len(paths) == 2 * sum(entry.study == "thesis" for entry in FIGURES.values())
     lines = []
     run_named("thesis", folder.parent, quick=True, plant="jax", progress=False, say=lines.append)

@@ -53,7 +53,7 @@ def no_figures(monkeypatch):
     """Figures have tests of their own."""
     drawn = []
     monkeypatch.setattr("figures.sweep.draw.draw_sweep", lambda store, folder: drawn.append((store, folder)))
-    monkeypatch.setattr("figures.sweep.draw.draw_run", lambda *given, **options: drawn.append(given) or [])
+    monkeypatch.setattr("figures.closed_loop.draw_run", lambda *given, **options: drawn.append(given) or [])
     return drawn
 
 

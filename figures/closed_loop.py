@@ -1,0 +1,150 @@
+"""One closed loop as the panels read it, and its figure: CVs with setpoints above, MVs below.
+
+`jaxmpc simulate` draws a scenario that was run again with `draw_run`; `figures.show` and the app (`figures.explore`) share
+the rest.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from figures import panels, style
+from jaxmpc.loop.trajectory import Trajectory
+from studies.definition.presets import CHOKE
+
+RUN = "run"  # name of the one controller in results of one run; `studies.notebooks.loop` says the same
+PINNED: dict[str, Any] = {"colour": "#9A9A9A", "linewidth": 1.8, "label": "pinned", "zorder": 1.5}
+
+
+@style.house_style
+def draw_run(
+    trajectory: Trajectory,
+    deadzone: np.ndarray | tuple[float, ...],
+    folder: str | Path,
+    title: str,
+    *,
+    kind: str = "mixed-integer",
+    actuator: str = "step",
+    name: str = "run",
+) -> list[Path]:
+    """Draw one run: CVs with setpoint and deadzone, demanded and actual choke, lift.
+
+    Args:
+        trajectory: of the well.
+        deadzone: half width per CV [CV unit]; 0 draws no band.
+        folder: for the files.
+        title: above the panels.
+        kind: of the controller, for the colour.
+        actuator: of the choke, for the colour.
+        name: of the files.
+
+    Returns:
+        The PNG and the PDF.
+    """
+    return style.save(run(of_trajectory(trajectory, deadzone, kind, actuator), title), folder, name)
+
+
+def run(data: xr.Dataset, title: str) -> Figure:
+    """The figure of `draw_run`, from results of one controller called ``run``."""
+    drawn, axes = style.figure(data.sizes["cv"] + data.sizes["mv"], row_height=1.8)
+    drawn.suptitle(textwrap.fill(title, 95), fontsize=10)
+    tracking(axes, data, RUN)
+    return drawn
+
+
+def tracking(
+    axes: Iterable[Axes],
+    data: xr.Dataset,
+    controller: str,
+    pinned: xr.Dataset | None = None,
+    legend: bool = True,
+    bins: int = 12,
+) -> None:
+    """CVs with setpoint and deadzone, then MVs, the choke with what was demanded; a pinned run in grey behind.
+
+    Args:
+        axes: one panel per CV and MV.
+        data: results.
+        controller: name of a run in them.
+        pinned: results of one controller `RUN` to compare with; only times of `data` are drawn.
+        legend: whether panels have legends of their own.
+        bins: numbers along a time axis, at most.
+    """
+    start, end = panels.span(data)
+    cvs = panels.cv_names(data)
+    for ax, channel in zip(axes, [*cvs, *panels.mv_names(data)], strict=True):
+        seconds = panels.time_axis(ax, start, end, bins)
+        spec = ax.get_subplotspec()
+        if spec is not None and not spec.is_last_row():
+            ax.set_xlabel("")
+        if pinned is not None:
+            inside = pinned.isel(time=np.flatnonzero(pinned.time.values < end))
+            draw = panels.measured if channel in cvs else panels.manipulated
+            draw(ax, inside, RUN, channel, seconds, **PINNED)
+        if channel in cvs:
+            panels.controlled(ax, data, controller, channel, seconds, legend=legend)
+        else:
+            demand = channel == CHOKE and "demand" in data
+            panels.manipulated(ax, data, controller, channel, seconds, demand=demand)
+            if legend and demand:
+                panels.legend_above(ax)
+        panels.changes(ax, data, seconds)
+
+
+def of_trajectory(trajectory: Trajectory, deadzone: Any, kind: str, actuator: str) -> xr.Dataset:
+    """A trajectory as `results` of one run; its other arguments."""
+    arrays = {
+        "measurement": trajectory.cv,
+        "position": trajectory.mv,
+        "demand": trajectory.mv_demand,
+        "setpoint": trajectory.setpoint,
+    }
+    coords = {
+        "time": trajectory.time,
+        "cv": list(trajectory.cv_names),
+        "mv": list(trajectory.mv_names),
+        "cv_unit": ("cv", list(trajectory.cv_units)),
+        "mv_unit": ("mv", list(trajectory.mv_units)),
+    }
+    return results(arrays, coords, trajectory.dt, deadzone, kind, actuator)
+
+
+def results(
+    arrays: dict[str, Any], coords: dict[str, Any], dt: float, deadzone: Any, kind: str, actuator: str
+) -> xr.Dataset:
+    """One run as panels read the results of a comparison: its controller is called `RUN`.
+
+    Args:
+        arrays: ``measurement`` and ``setpoint`` of ``"time cv"``, ``position`` and perhaps ``demand`` of ``"time mv"``.
+        coords: ``time`` [s], ``cv``, ``mv``, and their units ``cv_unit`` and ``mv_unit``.
+        dt: sampling interval [s].
+        deadzone: half width for all CVs or per CV [CV unit]; 0 without Soft MPC.
+        kind: of the controller.
+        actuator: of the choke.
+    """
+    changed = np.any(np.diff(arrays["setpoint"], axis=0) != 0, axis=1)
+    half = np.broadcast_to(np.asarray(deadzone, dtype=float), (1, len(coords["cv"])))
+    variables: dict[str, Any] = {
+        name: (("controller", "time", "cv" if name == "measurement" else "mv"), np.asarray(values)[None])
+        for name, values in arrays.items()
+        if name != "setpoint"
+    }
+    variables |= {
+        "setpoint": (("time", "cv"), np.asarray(arrays["setpoint"])),
+        "window": ("time", np.concatenate([[0], np.cumsum(changed)])),
+        "kind": ("controller", [kind]),
+        "actuator": ("controller", [actuator]),
+        "tuning_deadzone": (("controller", "cv"), half),
+        **dict.fromkeys(
+            ("tuning_soft_quadratic", "tuning_soft_linear"), (("controller", "cv"), 1.0 * (half > 0))
+        ),
+    }
+    return xr.Dataset(variables, {"controller": [RUN], **coords}, {"dt": dt})

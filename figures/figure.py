@@ -1,0 +1,56 @@
+"""What a figure is: its number, the study that it reads, the function that draws it, and what to say about it.
+
+Drawing, caption and entry of a figure stand in one file of `figures.thesis`; `figures.registry` collects the entries.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import xarray as xr
+from matplotlib.figure import Figure
+
+from figures import style
+
+
+@dataclasses.dataclass(frozen=True)
+class FigureEntry:
+    """One figure.
+
+    Attributes:
+        id: ``10`` for thesis figure 10, or a name.
+        title: what it shows.
+        study: name in `studies.thesis.catalogue.STUDIES` of the study whose results it reads; None if it reads none.
+        name: of its files.
+        function: makes it from the results and `arguments`.
+        caption: one to three sentences on what to see, or a function of the results and `arguments` that gives them.
+        alt: what is drawn, for readers who do not see it.
+        needs: controllers whose runs must be finished.
+        arguments: for `function` and `caption` beside the results.
+    """
+
+    id: str
+    title: str
+    study: str | None
+    name: str
+    function: Callable[..., Figure]
+    caption: str | Callable[..., str]
+    alt: str
+    needs: tuple[str, ...] = ()
+    arguments: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def source(self) -> str:
+        """The function that draws it, as ``module.function``."""
+        return f"{self.function.__module__}.{self.function.__name__}"
+
+    @style.house_style
+    def draw(self, data: xr.Dataset | None) -> Figure:
+        """The figure from the results of its study."""
+        return self.function(data, **self.arguments)
+
+    def text(self, data: xr.Dataset | None) -> str:
+        """Its caption."""
+        return self.caption(data, **self.arguments) if callable(self.caption) else self.caption

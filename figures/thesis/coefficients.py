@@ -1,0 +1,63 @@
+"""Thesis figures 10 and 11: steady-state step coefficients over the choke position, for three lift rates (thesis 4.1.1)."""
+
+from __future__ import annotations
+
+import xarray as xr
+from matplotlib.figure import Figure
+
+from figures import panels, style
+from figures.figure import FigureEntry
+from studies.definition.presets import GAS, OIL
+
+MARKERS = ("o", "s", "^")
+WORKING_CHOKE = 50.0  # %, where the model is identified
+
+
+def draw(data: xr.Dataset, cv: str) -> Figure:
+    """The coefficients of one CV.
+
+    Args:
+        data: results of the thesis study, with `sweep_coefficient`.
+        cv: name of the CV.
+    """
+    curves = data.sweep_coefficient.sel(cv=cv)
+    drawn, (axes,) = style.figure(1, row_height=3.6)
+    for lift, mark, (colour, line) in zip(curves.sweep_lift.values, MARKERS, style.SERIES, strict=False):
+        look = {"color": colour, "linestyle": line, "marker": mark, "markersize": 3.2}
+        values = curves.sel(sweep_lift=lift).values
+        axes.plot(curves.sweep_choke.values, values, **look, label=f"gas lift {lift:.0f} m³/h")
+    axes.axhline(0, color=style.BLACK, linewidth=0.8)
+    axes.set_xlim(0, 100)
+    axes.set_xlabel("choke position before the step [%]")
+    per = f"{panels.unit_of(data, cv)} per %"
+    axes.set_ylabel(f"{style.name_of(cv)}: steady change\nper % of choke [{per}]")
+    axes.legend()
+    return drawn
+
+
+def caption(data: xr.Dataset, cv: str) -> str:
+    """How much the largest gain is above that of the model."""
+    curves = data.sweep_coefficient.sel(cv=cv)
+    largest = curves.where(curves == curves.max(), drop=True)
+    at, lift = float(largest.sweep_choke.values[0]), largest.sweep_lift.values[0]
+    working = float(curves.sel(sweep_lift=lift).interp(sweep_choke=WORKING_CHOKE).item())
+    return (
+        f"The gain of the choke on the {style.name_of(cv)} depends on where it stands: at a lift of {lift:.0f} m³/h a "
+        f"step at {at:.0f} % does {float(curves.max()) / working:.1f} times as much as one at {WORKING_CHOKE:.0f} %, where "
+        "the prediction model is identified."
+    )
+
+
+ENTRIES = tuple(
+    FigureEntry(
+        id,
+        f"{style.name_of(cv)}: steady-state step coefficients over the choke",
+        "thesis",
+        f"figure_{id}_{cv.removesuffix('_rate')}_coefficients",
+        draw,
+        caption,
+        f"Three curves, one per gas-lift rate: steady change of the {style.name_of(cv)} per % of choke over the choke.",
+        arguments={"cv": cv},
+    )
+    for id, cv in (("10", OIL), ("11", GAS))
+)

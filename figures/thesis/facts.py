@@ -1,0 +1,60 @@
+"""Numbers that captions say: how often a choke turns back, what a run settles at, and how they are written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import xarray as xr
+
+from studies.definition.presets import CHOKE
+from studies.kpi import loop as kpi
+
+LATE = 600.0  # s at the end of a stretch that stand for what it settles at
+
+
+def choke_moves(data: xr.Dataset, controller: str) -> np.ndarray:
+    """Moves of the actual choke position, ``"sample"`` [%]; none in the first sample of a part of a run."""
+    run = data.sel(controller=controller, mv=CHOKE)
+    position = run.position.values
+    whole = float(data.time.values[0]) == 0.0
+    start = run.demand.values[0] - run.move.values[0] if whole else position[0]  # as in the key figures
+    return np.asarray(kpi.moves_of(position, start))
+
+
+def reversals(data: xr.Dataset, controller: str) -> int:
+    """How often the choke reverses."""
+    return int(np.asarray(kpi.reversal_events(choke_moves(data, controller))).sum())
+
+
+def turns(data: xr.Dataset, controller: str, segment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Choke reversals within each segment, ``"time"``, and the position of the choke [%]."""
+    position = data.position.sel(controller=controller, mv=CHOKE).values
+    move = np.diff(position, prepend=position[:1])
+    return np.asarray(kpi.reversal_events(move, segment=segment)), position
+
+
+def times(count: int) -> str:
+    """How often, in words."""
+    return {0: "never", 1: "once", 2: "twice"}.get(count, f"{count} times")
+
+
+def between(data: xr.Dataset, start: float, end: float = np.inf, closed: bool = True) -> xr.Dataset:
+    """Samples from one time to another [s], that of the end included if `closed`."""
+    before = data.time.values <= end if closed else data.time.values < end
+    return data.isel(time=np.flatnonzero((data.time.values >= start) & before))
+
+
+def settled(data: xr.Dataset, controller: str) -> dict[str, float]:
+    """Mean deviation from the setpoint in the last `LATE` seconds, by CV [CV unit]."""
+    run = data.sel(controller=controller)
+    away = (run.measurement - run.setpoint).isel(time=data.time.values > data.time.values[-1] - LATE)
+    return {str(cv): float(away.sel(cv=cv).mean()) for cv in away.cv.values}
+
+
+def time_note(data: xr.Dataset, controllers: Iterable[str]) -> str:
+    """What to know of times per sample where compiled loops have none of their own; empty otherwise."""
+    times = (data.solve_time.sel(controller=name).values for name in controllers)
+    if any(len(np.unique(run)) < data.sizes["time"] / 10 for run in times):
+        return " On the JAX well samples run compiled, many at once; each has their mean time."
+    return ""
