@@ -3,14 +3,14 @@
 from importlib import import_module as _import_module
 from typing import Any as _Any
 
-_QUICK = ("pareto", "plot")  # of `figures.show`
+_QUICK = {"pareto": "figures.sweep.wear", "plot": "figures.show"}
 
 
 def __getattr__(name: str) -> _Any:
-    """The quick looks of `figures.show`, so that importing the package stays light."""
+    """The quick looks, so that importing the package stays light."""
     if name not in _QUICK:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(_import_module("figures.show"), name)
+    return getattr(_import_module(_QUICK[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -21,7 +21,7 @@ from jaxmpc.loop.trajectory import Trajectory
 from studies.definition.presets import CHOKE
 
 RUN = "run"  # name of the one controller in results of one run; `studies.notebooks.loop` says the same
-PINNED: dict[str, Any] = {"colour": "#9A9A9A", "linewidth": 1.8, "label": "pinned", "zorder": 1.5}
+PINNED: dict[str, Any] = {"color": "#9A9A9A", "linewidth": 1.8, "label": "pinned", "zorder": 1.5}
 
 
 @style.house_style
@@ -100,51 +100,44 @@ def tracking(
 
 
 def of_trajectory(trajectory: Trajectory, deadzone: Any, kind: str, actuator: str) -> xr.Dataset:
-    """A trajectory as `results` of one run; its other arguments."""
-    arrays = {
-        "measurement": trajectory.cv,
-        "position": trajectory.mv,
-        "demand": trajectory.mv_demand,
-        "setpoint": trajectory.setpoint,
-    }
-    coords = {
-        "time": trajectory.time,
-        "cv": list(trajectory.cv_names),
-        "mv": list(trajectory.mv_names),
-        "cv_unit": ("cv", list(trajectory.cv_units)),
-        "mv_unit": ("mv", list(trajectory.mv_units)),
-    }
-    return results(arrays, coords, trajectory.dt, deadzone, kind, actuator)
+    """A trajectory as `results`; its other arguments."""
+    run = xr.Dataset(
+        {
+            "measurement": (("time", "cv"), trajectory.cv),
+            "position": (("time", "mv"), trajectory.mv),
+            "demand": (("time", "mv"), trajectory.mv_demand),
+            "setpoint": (("time", "cv"), trajectory.setpoint),
+        },
+        {
+            "time": trajectory.time,
+            "cv": list(trajectory.cv_names),
+            "mv": list(trajectory.mv_names),
+            "cv_unit": ("cv", list(trajectory.cv_units)),
+            "mv_unit": ("mv", list(trajectory.mv_units)),
+        },
+    )
+    return results(run, trajectory.dt, deadzone, kind, actuator)
 
 
-def results(
-    arrays: dict[str, Any], coords: dict[str, Any], dt: float, deadzone: Any, kind: str, actuator: str
-) -> xr.Dataset:
+def results(run: xr.Dataset, dt: float, deadzone: Any, kind: str, actuator: str) -> xr.Dataset:
     """One run as panels read the results of a comparison: its controller is called `RUN`.
 
     Args:
-        arrays: ``measurement`` and ``setpoint`` of ``"time cv"``, ``position`` and perhaps ``demand`` of ``"time mv"``.
-        coords: ``time`` [s], ``cv``, ``mv``, and their units ``cv_unit`` and ``mv_unit``.
+        run: ``measurement`` and ``setpoint`` ``"time cv"``, ``position`` and perhaps ``demand`` ``"time mv"``, with units.
         dt: sampling interval [s].
         deadzone: half width for all CVs or per CV [CV unit]; 0 without Soft MPC.
         kind: of the controller.
         actuator: of the choke.
     """
-    changed = np.any(np.diff(arrays["setpoint"], axis=0) != 0, axis=1)
-    half = np.broadcast_to(np.asarray(deadzone, dtype=float), (1, len(coords["cv"])))
+    changed = np.any(np.diff(run.setpoint.values, axis=0) != 0, axis=1)
+    half = np.broadcast_to(np.asarray(deadzone, dtype=float), (1, run.sizes["cv"]))
     variables: dict[str, Any] = {
-        name: (("controller", "time", "cv" if name == "measurement" else "mv"), np.asarray(values)[None])
-        for name, values in arrays.items()
-        if name != "setpoint"
-    }
-    variables |= {
-        "setpoint": (("time", "cv"), np.asarray(arrays["setpoint"])),
+        "setpoint": run.setpoint,
         "window": ("time", np.concatenate([[0], np.cumsum(changed)])),
         "kind": ("controller", [kind]),
         "actuator": ("controller", [actuator]),
         "tuning_deadzone": (("controller", "cv"), half),
-        **dict.fromkeys(
-            ("tuning_soft_quadratic", "tuning_soft_linear"), (("controller", "cv"), 1.0 * (half > 0))
-        ),
     }
-    return xr.Dataset(variables, {"controller": [RUN], **coords}, {"dt": dt})
+    for name in ("tuning_soft_quadratic", "tuning_soft_linear"):
+        variables[name] = (("controller", "cv"), 1.0 * (half > 0))
+    return run.expand_dims(controller=[RUN]).assign(variables).assign_attrs(dt=dt)

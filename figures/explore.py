@@ -21,7 +21,6 @@ from figures.sweep.data import controller_of, deviation, figure_of, load, settin
 from figures.sweep.wear import front
 from figures.thesis.plans import BEFORE, draw_plan
 from jaxmpc.errors import InputError
-from studies.definition.presets import TUNINGS
 from studies.kpi.evaluate import completed, key_figures
 from studies.store.comparison import RESULTS, open_results
 from studies.thesis.plans import plan_at
@@ -85,35 +84,25 @@ def points(store: str | Path) -> pd.DataFrame:
     """
     if is_comparison(store):
         data = completed(open_results(store))
-        figures = key_figures(data)
-        zones = np.array([TUNINGS["thesis"]["deadzone"][str(cv)] for cv in figures.cv.values])
-        table = {
-            "number": np.arange(data.sizes["controller"]),
-            "run": [str(label) for label in data.label.values],
-            X: figures.choke_travel.values.astype(float),
-            Y: (figures.mean_absolute_deviation.values / zones).mean(axis=1),
-            "group": [str(label) for label in data.label.values],
-        }
-        title = "controller"
+        figures = key_figures(data).load()
+        texts = {}
+        title, numbers, names = "controller", np.arange(data.sizes["controller"]), data.label.values.tolist()
+        groups = names
     else:
-        data = load(store)
+        data = figures = load(store)
         axes = sweep_axes(data)
         texts = {_plain(axis.label): [axis.text(v) for v in axis.values.tolist()] for axis in axes}
-        names = [
-            ", ".join(f"{name} {text[i]}" for name, text in texts.items())
-            for i in range(data.sizes["scenario"])
-        ]
-        table = {
-            "number": data.scenario.values,
-            "run": names,
-            X: figure_of(data, "choke_travel").values.astype(float),
-            Y: deviation(data).values.astype(float),
-            "group": next(iter(texts.values()), ["all"] * len(names)),
-            **texts,
-        }
-        title = _plain(axes[0].title) if axes else ""
-    table["best"] = np.where(front(table[X], table[Y]), "on the front", "beaten")
-    out = pd.DataFrame(table)
+        title, numbers = _plain(axes[0].title) if axes else "", data.scenario.values
+        rows = zip(*texts.values(), strict=True) if texts else [()] * len(numbers)
+        names = [", ".join(map(" ".join, zip(texts, row, strict=True))) for row in rows]
+        groups = next(iter(texts.values()), ["all"] * len(names))
+    travel, away = (
+        values.values.astype(float) for values in (figure_of(figures, "choke_travel"), deviation(figures))
+    )
+    best = np.where(front(travel, away), "on the front", "beaten")
+    out = pd.DataFrame(
+        {"number": numbers, "run": names, X: travel, Y: away, "group": groups, **texts, "best": best}
+    )
     out.attrs["group"] = title
     return out
 
@@ -147,13 +136,12 @@ def stored(store: str | Path, number: int) -> xr.Dataset:
     kinds, actuators = controller_of(whole)
     place = int(np.flatnonzero(whole.scenario.values == number)[0])
     one = whole[stored_as].sel(scenario=number).load()
+    one = one.drop_vars([str(name) for name, coord in one.coords.items() if coord.ndim == 0])
     last = np.flatnonzero(np.isfinite(one.measurement.values).all(axis=1))
     one = one.isel(time=slice(0, int(last[-1]) + 1 if last.size else 0))
     dt = float(np.diff(one.time.values[:2])[0]) if one.sizes["time"] > 1 else 1.0
     zones = [_deadzone(whole, place, str(cv)) for cv in one.cv.values]
-    coords = {name: one[name] for name in ("time", "cv", "mv", "cv_unit", "mv_unit")}
-    arrays = {name: one[name].values for name in stored_as}
-    return closed_loop.results(arrays, coords, dt, zones, str(kinds[place]), str(actuators[place]))
+    return closed_loop.results(one, dt, zones, str(kinds[place]), str(actuators[place]))
 
 
 def scatter(table: pd.DataFrame) -> Any:

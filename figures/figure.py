@@ -6,6 +6,7 @@ Drawing, caption and entry of a figure stand in one file of `figures.thesis`; `f
 from __future__ import annotations
 
 import dataclasses
+import inspect
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -24,9 +25,8 @@ class FigureEntry:
         title: what it shows.
         study: name in `studies.thesis.catalogue.STUDIES` of the study whose results it reads; None if it reads none.
         name: of its files.
-        function: makes it from the results and `arguments`.
+        function: makes it from the results and `arguments`; its docstring begins with what is drawn.
         caption: one to three sentences on what to see, or a function of the results and `arguments` that gives them.
-        alt: what is drawn, for readers who do not see it.
         needs: controllers whose runs must be finished.
         arguments: for `function` and `caption` beside the results.
     """
@@ -37,7 +37,6 @@ class FigureEntry:
     name: str
     function: Callable[..., Figure]
     caption: str | Callable[..., str]
-    alt: str
     needs: tuple[str, ...] = ()
     arguments: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -51,6 +50,11 @@ class FigureEntry:
         """The figure from the results of its study."""
         return self.function(data, **self.arguments)
 
+    @property
+    def alt(self) -> str:
+        """What is drawn, for readers who do not see it."""
+        return " ".join(str(inspect.getdoc(self.function)).partition("\n\n")[0].split())
+
     def text(self, data: xr.Dataset | None) -> str:
         """Its caption."""
-        return self.caption(data, **self.arguments) if callable(self.caption) else self.caption
+        return style.minus(self.caption(data, **self.arguments) if callable(self.caption) else self.caption)

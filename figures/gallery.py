@@ -6,6 +6,7 @@ The page is one file that needs nothing else: pictures are embedded, and there i
 from __future__ import annotations
 
 import html
+import string
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from studies.definition.comparison import PLANTS, PlantKind
 from studies.store.comparison import open_results
 
 PAGE = "index.html"
+TEMPLATE = Path(__file__).with_name("gallery.html")
 LARGEST = 10_000_000  # bytes; a page that opens at once and can be mailed
 
 
@@ -107,55 +109,5 @@ def _page(entries: list[FigureEntry], sections: list[str], quick: bool, plant: P
     )
     well = "an FMU of the well" if plant == "fmu" else "the JAX twin of the well"
     length = "shortened studies" if quick else "full studies"
-    body = "\n".join(sections)
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Figures of jaxmpc</title>
-<style>{_STYLE}</style>
-</head>
-<body>
-<header>
-<h1>Figures</h1>
-<p>Model predictive control with a discrete choke on a gas-lifted oil well: the figures of the thesis, drawn from our own
-runs ({length}, {well}). Numbers in the captions come from the same results as the curves.</p>
-</header>
-<nav id="contents" aria-label="Contents">
-<h2>Contents</h2>
-<ol>
-{contents}
-</ol>
-</nav>
-<main>
-{body}
-</main>
-</body>
-</html>
-"""
-
-
-_STYLE = """
-:root { color-scheme: light dark; --page: #ffffff; --text: #1d1d1f; --quiet: #55585e; --line: #d9dbe0; --link: #005a96; }
-@media (prefers-color-scheme: dark) {
-  :root { --page: #17181b; --text: #e8e8ea; --quiet: #a9adb5; --line: #3a3d44; --link: #7cc0f2; }
-}
-body { margin: 0 auto; padding: 1.5rem; max-width: 62rem; background: var(--page); color: var(--text);
-  font: 1rem/1.5 system-ui, sans-serif; }
-h1, h2 { line-height: 1.25; }
-h2 { font-size: 1.2rem; }
-a { color: var(--link); }
-nav ol { list-style: none; padding: 0; columns: 22rem; }
-nav li { padding: 0.1rem 0; break-inside: avoid; }
-section { border-top: 1px solid var(--line); padding-top: 0.5rem; margin-top: 2rem; }
-figure { margin: 0; }
-img { display: block; max-width: 100%; height: auto; margin: 0 auto; background: #ffffff; padding: 0.5rem;
-  border-radius: 6px; box-sizing: border-box; }
-figcaption { margin-top: 0.8rem; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: 0.15rem 1rem; margin: 0.8rem 0 0; color: var(--quiet);
-  font-size: 0.9rem; }
-dt { font-weight: 600; }
-dd { margin: 0; overflow-wrap: anywhere; }
-.up { font-size: 0.9rem; margin: 0.5rem 0 0; }
-"""
+    blanks = {"contents": contents, "well": well, "length": length, "body": "\n".join(sections)}
+    return string.Template(TEMPLATE.read_text(encoding="utf-8")).substitute(blanks)

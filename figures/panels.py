@@ -21,9 +21,7 @@ HOUR = 3600.0
 SAME = 1e-6  # MV units between a demand and a position that are one line
 THIN: dict[str, Any] = {"color": style.GREY, "linestyle": (0, (3, 3)), "linewidth": 0.8}
 
-Curves = Mapping[
-    str, tuple[str, str | None]
-]  # label and colour by controller, None for that of the controller
+Curves = Mapping[str, Mapping[str, Any]]  # label, perhaps colour, of the curve of each controller
 
 
 def run_colour(data: xr.Dataset, controller: str) -> str:
@@ -141,47 +139,25 @@ def controlled(
         legend_above(axes)
 
 
-def measured(
-    axes: Axes,
-    data: xr.Dataset,
-    controller: str,
-    cv: str,
-    seconds: float,
-    label: str = "measured",
-    colour: str | None = None,
-    **look: Any,
-) -> None:
-    """A measured CV; in the controller's colour if none is given."""
+def measured(axes: Axes, data: xr.Dataset, controller: str, cv: str, seconds: float, **look: Any) -> None:
+    """A measured CV, in the controller's colour if `look` names none."""
     values = data.measurement.sel(controller=controller, cv=cv).values
-    look = {
-        "color": colour or run_colour(data, controller),
-        "linewidth": _width(data),
-        "label": label,
-        **look,
-    }
+    look = {"color": run_colour(data, controller), "linewidth": _width(data), "label": "measured", **look}
     axes.plot(data.time.values / seconds, values, **look)
     axes.set_ylabel(label_of(data, cv))
 
 
 def manipulated(
-    axes: Axes,
-    data: xr.Dataset,
-    controller: str,
-    mv: str,
-    seconds: float,
-    demand: bool = False,
-    label: str = "actual",
-    colour: str | None = None,
-    **look: Any,
+    axes: Axes, data: xr.Dataset, controller: str, mv: str, seconds: float, demand: bool = False, **look: Any
 ) -> None:
     """An MV as the actuator holds it over each sample, with the controller's demand if asked for and not the same."""
     run = data.sel(controller=controller, mv=mv)
-    width = _width(data)
+    look = {"color": run_colour(data, controller), "linewidth": _width(data), "label": "actual", **look}
     if demand and np.abs(run.demand.values - run.position.values).max() > SAME:
-        step(axes, data, run.demand, seconds, color=style.BLACK, linewidth=0.6 * width, label="demanded")
+        thin = 0.6 * look["linewidth"]
+        step(axes, data, run.demand, seconds, color=style.BLACK, linewidth=thin, label="demanded")
     elif demand:
-        label = "demanded and actual"
-    look = {"color": colour or run_colour(data, controller), "linewidth": width, "label": label, **look}
+        look["label"] = "demanded and actual"
     step(axes, data, run.position, seconds, **look)
     axes.set_ylabel(label_of(data, mv))
 
@@ -198,22 +174,12 @@ def bias(axes: Axes, data: xr.Dataset, controller: str, cv: str, seconds: float)
 def compared(
     axes: Axes, data: xr.Dataset, channel: str, curves: Curves, seconds: float, zone: str | None = None
 ) -> None:
-    """Several runs of a CV with its setpoint, or of an MV.
-
-    Args:
-        axes: to draw on.
-        data: results.
-        channel: a CV or an MV.
-        curves: what to draw.
-        seconds: in the unit of the time axis.
-        zone: controller whose deadzone is drawn with a CV.
-    """
+    """Several runs of a CV with its setpoint, and if `zone` is given the deadzone of that controller; or of an MV."""
     cv = is_cv(data, channel)
     if cv and zone is not None:
         deadzone_lines(axes, data, zone, channel, seconds)
-    for name, (label, colour) in curves.items():
-        draw = measured if cv else manipulated
-        draw(axes, data, name, channel, seconds, label=label, colour=colour)
+    for name, look in curves.items():
+        (measured if cv else manipulated)(axes, data, name, channel, seconds, **look)
     if cv:
         setpoint(axes, data, channel, seconds)
 

@@ -1,4 +1,4 @@
-"""`plot(thing)` and `pareto(study)`: a quick look at a model, tuning, plan, run or study, for notebooks.
+"""`plot(thing)`: a quick look at a model, tuning, plan, run or study, for notebooks.
 
 What is drawn is recognised by its type. The axes that come back show themselves as a PNG.
 """
@@ -11,13 +11,11 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from figures import closed_loop, panels, style
 from figures.explore import is_comparison
 from figures.sweep import wear
-from figures.sweep.data import load
 from figures.thesis.soft import cost
 from jaxmpc.errors import InputError
 from jaxmpc.loop.trajectory import Trajectory
@@ -69,20 +67,6 @@ def plot(
         expected = f"{', '.join(_DRAW)}, Trajectory, the path of a study store or an opened one"
         raise InputError("thing", type(thing).__name__, expected)
     return draw(thing, structure)
-
-
-def pareto(study: str | Path | xr.Dataset, x: str = "choke_travel", **options: Any) -> Axes:
-    """The runs of a sweep study, and the front of those that no other beats.
-
-    Args:
-        study: path of the store, or what `open_study` gave.
-        x: key figure along the horizontal axis.
-        **options: of `figures.sweep.wear.pareto`.
-
-    Raises:
-        InputError: if there is no store, or for a key figure that is not there.
-    """
-    return wear.pareto(load(study) if isinstance(study, str | Path) else study, x, **options)
 
 
 def _model(model: Any, _: Any) -> Panels:
@@ -154,7 +138,7 @@ def _study(study: str | Path | xr.Dataset) -> Panels:
     if comparison:
         return _runs(completed(study if isinstance(study, xr.Dataset) else open_results(study)).load())
     axes = _axes(1, 1, width=7.6, height=5.0)
-    wear.pareto(study if isinstance(study, xr.Dataset) else load(study), axes=axes[0, 0])
+    wear.pareto(study, axes=axes[0, 0])
     return axes
 
 
@@ -167,7 +151,9 @@ def _runs(data: xr.Dataset) -> Panels:
         return axes
     seconds = panels.time_axis(axes[-1, 0], *panels.span(data))
     labels = data.label if "label" in data.coords else data.controller
-    curves = {str(name): (str(labels.sel(controller=name).item()), None) for name in data.controller.values}
+    curves = {
+        str(name): {"label": str(labels.sel(controller=name).item())} for name in data.controller.values
+    }
     for ax, channel in zip(axes[:, 0], channels, strict=True):
         panels.compared(ax, data, channel, curves, seconds)
     panels.legend_above(axes[0, 0])

@@ -149,6 +149,6 @@ def label(channel: str, unit_text: str, what: str = "") -> str:
     return f"{name_of(channel)}{what} [{unit(unit_text)}]"
 
 
-def signed(value: float, form: str = "g") -> str:
-    """A number with its sign, format `form`."""
-    return f"{value:+{form}}".replace("-", "−")
+def minus(text: str) -> str:
+    """A text with the signs of its negative numbers as they are printed."""
+    return re.sub(r"(?<!\w)-(?=\d)", "−", text)

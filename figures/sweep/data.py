@@ -102,12 +102,8 @@ def load(store: str | Path) -> xr.Dataset:
         data = open_study(store)
     there = np.flatnonzero(data[FLAG].values > 0)
     if not len(there):
-        raise InputError(
-            "store",
-            str(store),
-            f"a finished scenario ({data.sizes['scenario']} in the study)",
-            "Give the command of the study to compute them",
-        )
+        expected = f"a finished scenario ({data.sizes['scenario']} in the study)"
+        raise InputError("store", str(store), expected, "Give the command of the study to compute them")
     facts = {"missing": data.sizes["scenario"] - len(there), "total": data.sizes["scenario"]}
     return data.isel(scenario=there).assign_attrs({**facts, "store": str(store)})
 
@@ -220,20 +216,13 @@ def thesis_tuning(data: xr.Dataset) -> np.ndarray:
     found = columns(data)
     varied = [key for key in found if key in TUNING or key.startswith("tuning.")]
     mask = np.full(data.sizes["scenario"], bool(varied))
-    for key in varied:
-        wanted = thesis_setting(key)
-        if wanted is not None:
-            mask &= found[key] == (wanted if found[key].dtype.kind in "biuf" else as_text(wanted))
-    for key in (*DECIDING, "preset", "soft"):
-        value = None if key in found else setting(data, key)
-        if value is not None:
-            mask &= (
-                as_text(value) == as_text(thesis_setting(key))
-                if isinstance(value, str | bool)
-                else value == thesis_setting(key)
-            )
-        elif key in DECIDING and key not in found:  # nothing can be said without them
-            mask &= False
+    for key in dict.fromkeys((*varied, *DECIDING, "preset", "soft")):
+        value, wanted = found[key] if key in found else setting(data, key), thesis_setting(key)
+        if value is None:  # nothing can be said without those that decide
+            mask &= key not in DECIDING
+        elif wanted is not None:
+            each = np.broadcast_to(value, mask.shape)
+            mask &= [one == (as_text(wanted) if isinstance(one, str) else wanted) for one in each]
     return mask
 
 

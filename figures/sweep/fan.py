@@ -40,23 +40,14 @@ def has_trajectories(data: xr.Dataset) -> bool:
 
 
 def bands(values: np.ndarray) -> np.ndarray:
-    """5th, 25th, 50th, 75th, 95th percentile over the scenarios, ``"5 time"``, without NaN.
-
-    Args:
-        values: ``"scenario time"``.
-    """
+    """5th, 25th, 50th, 75th, 95th percentile ``"5 time"`` of values ``"scenario time"``, without NaN."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "All-NaN", RuntimeWarning)  # times that no run reaches
         return np.nanpercentile(values, [5, 25, 50, 75, 95], axis=0)
 
 
 def fan(data: xr.Dataset, found: list[Variant]) -> Figure:
-    """Median and bands of each CV and of the choke over time, a column of panels per variant.
-
-    Args:
-        data: finished scenarios with trajectories.
-        found: variants, setpoints in common within each.
-    """
+    """Median and bands of each CV and of the choke over time, a column of panels per variant."""
     channels = [*panels.cv_names(data), CHOKE]
     width = 7.6 if len(found) < 3 else 3.4 * len(found)
     height = 1.75 * len(channels) + 1.2
@@ -117,12 +108,7 @@ def shares(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def distributions(data: xr.Dataset, found: list[Variant]) -> Figure:
-    """Sorted choke travel and deviations, a line per variant; the worst run of each is named, with its command.
-
-    Args:
-        data: finished scenarios.
-        found: variants.
-    """
+    """Sorted choke travel and deviations, a line per variant; the worst run of each is named, with its command."""
     shown = quantities(data, panels.cv_names(data))
     drawn, grid = style.grid(1, len(shown), 3.1 * len(shown), 3.9, sharey=True)
     said = []

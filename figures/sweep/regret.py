@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
-from matplotlib.transforms import Bbox
 
 from figures import panels, style
 from figures.sweep import sheet
@@ -22,7 +21,7 @@ from studies.definition.fields import as_text
 COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.ORANGE, style.PURPLE, style.SKY, style.GREY)
 MODES = {"moves": "o", "inputs": "s", "none": "^"}
 ROUND = ((1, 0.6), (1, -0.6), (-1, 0.6), (-1, -0.6), (0, 1), (0, -1), (1, 0), (-1, 0))
-SHIFTS = [(r * dx, r * dy) for r in (7, 13, 20, 28, 38, 50, 65, 80) for dx, dy in ROUND]  # pt
+SHIFTS = np.array([(r * dx, r * dy) for r in (7, 13, 20, 28, 38, 50, 65, 80) for dx, dy in ROUND])  # pt
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -102,11 +101,7 @@ def quartiles(values: np.ndarray) -> np.ndarray:
 
 
 def draw(data: xr.Dataset) -> Figure:
-    """Regret over median and 99th percentile of the solve time, and over the number of unknowns.
-
-    Args:
-        data: finished scenarios.
-    """
+    """Regret over median and 99th percentile of the solve time, and over the number of unknowns, of finished scenarios."""
     variants = blockings(data)
     lost, reference = regret(data, variants)
     kinds = list(dict.fromkeys(variant.label for variant in variants))
@@ -189,7 +184,7 @@ def _magnitudes(values: np.ndarray) -> bool:
 
 def place_labels(
     ax: Axes, names: list[tuple[str, str]], places: list[tuple[float, float]], size: float = 8.0
-) -> list[Bbox]:
+) -> None:
     """Write labels beside points, where they cover neither a point nor each other as far as there is room.
 
     Args:
@@ -197,44 +192,35 @@ def place_labels(
         names: text and colour of each label.
         places: of the points, in data units.
         size: of the text [pt].
-
-    Returns:
-        The boxes of the labels on the page [pixel].
     """
     canvas: Any = ax.figure.canvas
-    renderer = canvas.get_renderer()
     pixel = ax.figure.dpi / 72
-    frame = ax.get_window_extent(renderer)
     points = ax.transData.transform(places) if places else np.zeros((0, 2))
-    taken = [Bbox([point - 5 * pixel, point + 5 * pixel]) for point in points]
-    boxes: list[Bbox] = []
+    taken = np.hstack([points - 5 * pixel, points + 5 * pixel])  # left, bottom, right, top of each
+    frame = np.array([ax.get_window_extent(canvas.get_renderer()).extents])
     for i in np.argsort(-points[:, 1], kind="stable"):
         (text, colour), point = names[i], points[i]
         look: dict[str, Any] = {"textcoords": "offset points", "fontsize": size, "color": colour}
-        note = ax.annotate(text, places[i], xytext=(0, 0), **look)
-        extent = note.get_window_extent(renderer)
+        note = ax.annotate(text, places[i], (0, 0), **look)
+        extent = np.array(note.get_window_extent(canvas.get_renderer()).size)
         note.remove()
-        others = [*taken[:i], *taken[i + 1 :], *boxes]
-        best, least, far = extent, np.inf, False
-        for dx, dy in SHIFTS:
-            left = point[0] + dx * pixel - extent.width * (0.5 - 0.5 * np.sign(dx))
-            low = point[1] + dy * pixel - extent.height / 2
-            box = Bbox.from_bounds(left, low, extent.width, extent.height)
-            covered = sum(_common(box, other) for other in others)
-            covered += extent.width * extent.height - _common(box, frame)  # what hangs out
-            if covered < least - 1e-9:
-                best, least, far = box, covered, max(abs(dx), abs(dy)) > 14
-            if covered == 0:
-                break
-        boxes.append(best)
-        corner = (best.x0 - point[0]) / pixel, (best.y0 - point[1]) / pixel
+        corners = point + SHIFTS * pixel - extent * (0.5 - 0.5 * np.sign(SHIFTS) * (1, 0))
+        boxes = np.hstack([corners, corners + extent])
+        covered = _common(boxes, np.delete(taken, i, axis=0)).sum(axis=1)
+        covered += extent.prod() - _common(boxes, frame)[:, 0]  # what hangs out
+        best = int(np.argmin(covered.round(9)))
+        taken = np.vstack([taken, boxes[best]])
         line = {"arrowstyle": "-", "color": colour, "linewidth": 0.5, "shrinkA": 0, "shrinkB": 4}
         look |= {"va": "bottom", "zorder": 4, "path_effects": [withStroke(linewidth=2, foreground="white")]}
-        ax.annotate(text, places[i], xytext=corner, arrowprops=line if far else None, **look)
-    return boxes
+        far = np.abs(SHIFTS[best]).max() > 14
+        ax.annotate(
+            text, places[i], (corners[best] - point) / pixel, arrowprops=line if far else None, **look
+        )
 
 
-def _common(one: Bbox, other: Bbox) -> float:
-    """Area that two boxes share."""
-    both = Bbox.intersection(one, other)
-    return both.width * both.height if both is not None else 0.0
+def _common(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Areas ``"one other"`` that boxes share."""
+    sides = np.minimum(one[:, None, 2:], other[None, :, 2:]) - np.maximum(
+        one[:, None, :2], other[None, :, :2]
+    )
+    return np.maximum(sides, 0.0).prod(axis=2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from matplotlib.lines import Line2D
 
 from figures import style
 from figures.sweep import sheet
-from figures.sweep.data import SweepAxis, deviation, figure_of, sweep_axes, thesis_tuning
+from figures.sweep.data import SweepAxis, deviation, figure_of, load, sweep_axes, thesis_tuning
 from jaxmpc.errors import InputError
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "d")
@@ -46,7 +47,7 @@ def front(x, y) -> np.ndarray:
 
 @style.house_style
 def pareto(
-    data: xr.Dataset,
+    data: str | Path | xr.Dataset,
     x: str = "choke_travel",
     y: str = "mean_absolute_deviation",
     color: str | None = None,
@@ -58,7 +59,7 @@ def pareto(
     """Scenarios as points, the front of those that none beats as a line, the thesis tuning with a ring.
 
     Args:
-        data: of `studies.store.reading.open_study`, or finished scenarios of it.
+        data: path of a store, what `studies.store.reading.open_study` gave, or finished scenarios of it.
         x: key figure along the horizontal axis.
         y: key figure along the vertical axis. One per CV is drawn for `cv`, or as the mean over the CVs; where
             it has the unit of the CV, each is divided by its deadzone in the thesis (1000 and 5 m3/h) before.
@@ -71,8 +72,9 @@ def pareto(
         The axes; `axes.figure` is the figure.
 
     Raises:
-        InputError: for a key figure or column that is not there.
+        InputError: if there is no store, or for a key figure or column that is not there.
     """
+    data = data if isinstance(data, xr.Dataset) else load(data)
     axes = axes or style.figure(1, row_height=4.5)[1][0]
     (across, x_title), (up, y_title) = _figure(data, x, cv), _figure(data, y, cv)
     known = sweep_axes(data)
@@ -95,11 +97,7 @@ def pareto(
 
 
 def draw(data: xr.Dataset) -> Figure:
-    """The figure of a study.
-
-    Args:
-        data: finished scenarios.
-    """
+    """The figure of a study, from its finished scenarios."""
     drawn, ((axes,),) = style.grid(1, 1, 7.6, 5.3)
     pareto(data, axes=axes)
     finite = np.isfinite(figure_of(data, "choke_travel").values) & np.isfinite(deviation(data).values)

@@ -14,7 +14,7 @@ WORKING_CHOKE = 50.0  # %, where the model is identified
 
 
 def draw(data: xr.Dataset, cv: str) -> Figure:
-    """The coefficients of one CV.
+    """Three curves, one per gas-lift rate: steady change of the rate per % of choke over the choke.
 
     Args:
         data: results of the thesis study, with `sweep_coefficient`.
@@ -35,8 +35,7 @@ def draw(data: xr.Dataset, cv: str) -> Figure:
     return drawn
 
 
-def caption(data: xr.Dataset, cv: str) -> str:
-    """How much the largest gain is above that of the model."""
+def _caption(data: xr.Dataset, cv: str) -> str:
     curves = data.sweep_coefficient.sel(cv=cv)
     largest = curves.where(curves == curves.max(), drop=True)
     at, lift = float(largest.sweep_choke.values[0]), largest.sweep_lift.values[0]
@@ -55,8 +54,7 @@ ENTRIES = tuple(
         "thesis",
         f"figure_{id}_{cv.removesuffix('_rate')}_coefficients",
         draw,
-        caption,
-        f"Three curves, one per gas-lift rate: steady change of the {style.name_of(cv)} per % of choke over the choke.",
+        _caption,
         arguments={"cv": cv},
     )
     for id, cv in (("10", OIL), ("11", GAS))

@@ -45,7 +45,7 @@ def disturbed_at(data: xr.Dataset, _controller: str = INTEGER) -> float:
 
 
 def rates(data: xr.Dataset, controller: str, when: When) -> Figure:
-    """Measured CVs with setpoints and deadzones, and the event marked.
+    """Oil rate above gas rate over time, with setpoints and deadzones; a dotted line marks the event.
 
     Args:
         data: results.
@@ -56,13 +56,13 @@ def rates(data: xr.Dataset, controller: str, when: When) -> Figure:
 
 
 def inputs(data: xr.Dataset, controller: str, when: When) -> Figure:
-    """Choke and lift, and the event marked; arguments of `rates`."""
+    """Demanded and actual choke above the gas lift over time; a dotted line marks the event."""
     return _marked(runs.inputs(data, controller), data, when(data, controller))
 
 
 def _marked(drawn: Figure, data: xr.Dataset, at: float) -> Figure:
     drop = float(data.disturbance.min())
-    words = f"{style.signed(drop)} bar" if drop else "gas weights zero"
+    words = style.minus(f"{drop:+g} bar") if drop else "gas weights zero"
     seconds = panels.time_unit(*panels.span(data))[0]
     for ax in drawn.axes:
         panels.mark(ax, at / seconds, words)
@@ -72,7 +72,7 @@ def _marked(drawn: Figure, data: xr.Dataset, at: float) -> Figure:
 
 
 def pressure(data: xr.Dataset) -> Figure:
-    """Figure 33: the reservoir-pressure offset of the run; `data` are the results of the study ``disturbance``."""
+    """A step plot over time: offset of the reservoir pressure."""
     drawn, (axes,) = style.figure(1, row_height=2.6)
     seconds = panels.time_axis(axes, *panels.span(data))
     panels.step(axes, data, data.disturbance, seconds, color=style.BLACK)
@@ -81,20 +81,18 @@ def pressure(data: xr.Dataset) -> Figure:
     return drawn
 
 
-def retuned_caption(data: xr.Dataset, controller: str, when: When) -> str:
-    """Figure 29: what the run settles at before and after."""
+def _retuned_caption(data: xr.Dataset, controller: str, when: When) -> str:
     at = when(data, controller)
     before, after = settled(between(data, 0.0, at, closed=False), controller), settled(data, controller)
     return (
-        f"Until {at:,.0f} s the controller settles {style.signed(before[OIL], '.1f')} m³/h of oil and "
-        f"{style.signed(before[GAS], '.0f')} m³/h of gas off two setpoints that are out of reach together. "
-        f"Without gas weights the oil rate closes in on its setpoint: {style.signed(after[OIL], '.1f')} m³/h "
-        f"off at the end, and gas {style.signed(after[GAS], '.0f')} m³/h."
+        f"Until {at:,.0f} s the controller settles {before[OIL]:+.1f} m³/h of oil and "
+        f"{before[GAS]:+.0f} m³/h of gas off two setpoints that are out of reach together. "
+        f"Without gas weights the oil rate closes in on its setpoint: {after[OIL]:+.1f} m³/h "
+        f"off at the end, and gas {after[GAS]:+.0f} m³/h."
     )
 
 
-def disturbed_caption(data: xr.Dataset, controller: str, when: When) -> str:
-    """Figure 31: how far the oil rate falls, and what the run settles at."""
+def _disturbed_caption(data: xr.Dataset, controller: str, when: When) -> str:
     after = between(data, when(data, controller))
     run = after.sel(controller=controller, cv=OIL)
     fall, end = float((run.setpoint - run.measurement).max()), settled(after, controller)
@@ -103,13 +101,12 @@ def disturbed_caption(data: xr.Dataset, controller: str, when: When) -> str:
     )
     return (
         f"The pressure drop takes the oil rate up to {fall:.1f} m³/h below its setpoint. It ends "
-        f"{style.signed(end[OIL], '.1f')} m³/h off, the gas rate {style.signed(end[GAS], '.0f')} m³/h."
+        f"{end[OIL]:+.1f} m³/h off, the gas rate {end[GAS]:+.0f} m³/h."
         f"{compromise if abs(end[OIL]) > panels.soft_half_width(run) else ''}"
     )
 
 
-def inputs_caption(data: xr.Dataset, controller: str, when: When) -> str:
-    """Figures 30 and 32: where the MVs go."""
+def _inputs_caption(data: xr.Dataset, controller: str, when: When) -> str:
     at = when(data, controller)
     before = int(np.searchsorted(data.time.values, at)) - 1
     position = data.position.sel(controller=controller)
@@ -121,10 +118,9 @@ def inputs_caption(data: xr.Dataset, controller: str, when: When) -> str:
     )
 
 
-def pressure_caption(data: xr.Dataset) -> str:
-    """Size and time of the drop."""
+def _pressure_caption(data: xr.Dataset) -> str:
     return (
-        f"The disturbance of figures 31 and 32: the reservoir pressure changes by {style.signed(data.disturbance.min())} "
+        f"The disturbance of figures 31 and 32: the reservoir pressure changes by {data.disturbance.min():+g} "
         f"bar at {disturbed_at(data):,.0f} s and stays there; the controller is not told."
     )
 
@@ -138,17 +134,16 @@ ENTRIES = (
             f"figure_{id}_{function.__name__}_{study.replace('-', '_')}",
             function,
             caption,
-            f"{alt} A dotted line marks the event.",
             (INTEGER,),
             {"controller": INTEGER, "when": when},
         )
         for first, study, what, rates_caption, when in (
-            (29, "fine-regulation", "fine regulation of the oil rate", retuned_caption, retuned_at),
-            (31, "disturbance", "drop of the reservoir pressure", disturbed_caption, disturbed_at),
+            (29, "fine-regulation", "fine regulation of the oil rate", _retuned_caption, retuned_at),
+            (31, "disturbance", "drop of the reservoir pressure", _disturbed_caption, disturbed_at),
         )
-        for id, words, function, caption, alt in (
-            (first, "oil and gas rate", rates, rates_caption, runs.RATES_ALT),
-            (first + 1, "choke and gas lift", inputs, inputs_caption, runs.INPUTS_ALT),
+        for id, words, function, caption in (
+            (first, "oil and gas rate", rates, rates_caption),
+            (first + 1, "choke and gas lift", inputs, _inputs_caption),
         )
     ),
     FigureEntry(
@@ -157,7 +152,6 @@ ENTRIES = (
         "disturbance",
         "figure_33_pressure",
         pressure,
-        pressure_caption,
-        "A step plot over time: offset of the reservoir pressure.",
+        _pressure_caption,
     ),
 )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 import xarray as xr
 
@@ -50,11 +48,3 @@ def settled(data: xr.Dataset, controller: str) -> dict[str, float]:
     run = data.sel(controller=controller)
     away = (run.measurement - run.setpoint).isel(time=data.time.values > data.time.values[-1] - LATE)
     return {str(cv): float(away.sel(cv=cv).mean()) for cv in away.cv.values}
-
-
-def time_note(data: xr.Dataset, controllers: Iterable[str]) -> str:
-    """What to know of times per sample where compiled loops have none of their own; empty otherwise."""
-    times = (data.solve_time.sel(controller=name).values for name in controllers)
-    if any(len(np.unique(run)) < data.sizes["time"] / 10 for run in times):
-        return " On the JAX well samples run compiled, many at once; each has their mean time."
-    return ""

@@ -36,11 +36,7 @@ def near_closed(data: xr.Dataset) -> xr.Dataset:
 
 
 def draw(data: xr.Dataset) -> Figure:
-    """Oil rate and choke near closed with one model and with a schedule; below, reversals in every window of the run.
-
-    Args:
-        data: results of the study ``gain-scheduling``.
-    """
+    """Oil rate and choke over time in two columns, with and without Soft MPC; below, bars of reversals per window."""
     zoom = near_closed(data)
     drawn, axes = style.grid(3, 2, 9.6, 7.1)
     for column, (words, pair) in zip(axes[:2].T, list(PAIRS.items())[:2], strict=True):
@@ -48,9 +44,8 @@ def draw(data: xr.Dataset) -> Figure:
         rate.sharex(choke)
         rate.tick_params(labelbottom=False)
         seconds = panels.time_axis(choke, *panels.span(zoom), bins=6)
-        curves = {
-            name: (text, COLOURS[name]) for name, text in zip(pair, ("one model", "scheduled"), strict=True)
-        }
+        words_of = zip(pair, ("one model", "scheduled"), strict=True)
+        curves = {name: {"label": text, "color": COLOURS[name]} for name, text in words_of}
         for ax, channel in zip(column, (OIL, CHOKE), strict=True):
             panels.compared(ax, zoom, channel, curves, seconds, zone=pair[0])
         rate.set_title(words if "Soft" in words else f"{words} Soft MPC")
@@ -87,8 +82,7 @@ def _reversal_bars(axes: Axes, data: xr.Dataset) -> None:
     axes.set_ylim(top=1.5 * max(1.0, axes.get_ylim()[1]))
 
 
-def caption(data: xr.Dataset) -> str:
-    """Reversals of each pair."""
+def _caption(data: xr.Dataset) -> str:
     late = key_figures(data).late_reversals.sum("window")
     counts = "; ".join(
         f"{words} {int(late.sel(controller=one))} and {int(late.sel(controller=two))}"
@@ -107,8 +101,7 @@ ENTRIES = (
         "gain-scheduling",
         "gain_scheduling",
         draw,
-        caption,
-        "Oil rate and choke over time in two columns, with and without Soft MPC; below, bars of reversals per window.",
+        _caption,
         tuple(COLOURS),
     ),
 )

@@ -18,13 +18,12 @@ VIEW = (-0.4, 5.6)  # both axes
 
 
 def optima(_results=None) -> Figure:
-    """Figure 3: where the relaxation, its rounding and the integer program have their optima."""
+    """A plane with integer points, the triangle that two inequalities leave of it, and three optima marked."""
     drawn, axes = _plane()
     return _finish(drawn, axes, ("relaxed", "rounded", "integer"))
 
 
-def optima_caption(_results=None) -> str:
-    """The three optima in exact numbers."""
+def _optima_caption(_results=None) -> str:
     x, near, best = (find(EXAMPLE) for find in (example.relaxed_optimum, example.rounded, example.optimum))
     loss = 100 * (1 - EXAMPLE.value(near) / EXAMPLE.value(best))
     return (
@@ -34,7 +33,7 @@ def optima_caption(_results=None) -> str:
 
 
 def convex_hull(_results=None) -> Figure:
-    """Figure 4: the convex hull of the feasible integer points inside the relaxed set."""
+    """A plane with integer points; a grey polygon spans the feasible ones in the triangle of the relaxation."""
     drawn, axes = _plane()
     corners = np.array(example.hull(example.integer_points(EXAMPLE)), dtype=float)
     axes.fill(*corners.T, color="#C9C9C9", linewidth=0, label="convex hull of the integer points")
@@ -42,8 +41,7 @@ def convex_hull(_results=None) -> Figure:
     return _finish(drawn, axes)
 
 
-def hull_caption(_results=None) -> str:
-    """How many points and corners."""
+def _hull_caption(_results=None) -> str:
     corners = example.hull(example.integer_points(EXAMPLE))
     points = len(example.integer_points(EXAMPLE))
     return (
@@ -53,7 +51,7 @@ def hull_caption(_results=None) -> str:
 
 
 def valid_inequality(_results=None) -> Figure:
-    """Figure 5: a valid inequality with what it cuts off hatched, and the optimum that is left."""
+    """A plane with integer points; a line cuts a narrow strip, hatched, off the triangle of the relaxation."""
     row = example.best_cut(EXAMPLE).row
     drawn, axes = _plane()
     crossings = [point for known in EXAMPLE.rows if (point := example.crossing(row, known)) is not None]
@@ -70,8 +68,7 @@ def valid_inequality(_results=None) -> Figure:
     return _finish(drawn, axes)
 
 
-def cut_caption(_results=None) -> str:
-    """Where the cut comes from."""
+def _cut_caption(_results=None) -> str:
     found = example.best_cut(EXAMPLE)
     u = " and ".join(str(value) for value in found.multipliers)
     right = sum((a * b.limit for a, b in zip(found.multipliers, found.rows, strict=True)), start=Fraction(0))
@@ -147,7 +144,6 @@ def _line(row: Row) -> np.ndarray:
     return np.array([t, (limit - a * t) / b]) if b else np.array([[limit / a] * 2, t])
 
 
-_ALT = "A plane with integer points, the triangle that two inequalities leave of it, and the optima marked"
 ENTRIES = (
     FigureEntry(
         "3",
@@ -155,8 +151,7 @@ ENTRIES = (
         None,
         "figure_3_relaxation",
         optima,
-        optima_caption,
-        f"{_ALT}: relaxed, rounded and integer.",
+        _optima_caption,
     ),
     FigureEntry(
         "4",
@@ -164,8 +159,7 @@ ENTRIES = (
         None,
         "figure_4_convex_hull",
         convex_hull,
-        hull_caption,
-        f"{_ALT}; a grey polygon spans the feasible integer points.",
+        _hull_caption,
     ),
     FigureEntry(
         "5",
@@ -173,7 +167,6 @@ ENTRIES = (
         None,
         "figure_5_valid_inequality",
         valid_inequality,
-        cut_caption,
-        f"{_ALT}; one more line, with the narrow strip hatched that it cuts off.",
+        _cut_caption,
     ),
 )

@@ -18,21 +18,17 @@ OPENING = 2400.0  # s to show of the window in which the choke opens
 
 
 def draw(data: xr.Dataset) -> Figure:
-    """Choke and windowed mean of its moves while it opens, limit reactive and predictive; one column per controller.
-
-    Args:
-        data: results of the study ``mean-move``.
-    """
+    """Two columns, continuous and mixed-integer MPC: choke position above the windowed mean of its moves."""
     zoom = opening(data)
     at = np.isin(data.time.values, zoom.time.values)
     drawn, axes = style.grid(2, 2, 9.6, 5.1, sharex=True)
     for kind, (choke, mean) in zip(KINDS, axes.T, strict=True):
         seconds = panels.time_axis(mean, *panels.span(zoom), bins=6)
-        curves = {f"{kind}-{mode}": (mode, colour) for mode, colour in MODES.items()}
+        curves = {f"{kind}-{mode}": {"label": mode, "color": colour} for mode, colour in MODES.items()}
         panels.compared(choke, zoom, CHOKE, curves, seconds)
-        for name, (mode, colour) in curves.items():
+        for name, curve in curves.items():
             values = _means(data, name)[at]
-            mean.step(zoom.time.values / seconds, values, where="post", color=colour, label=mode)
+            mean.step(zoom.time.values / seconds, values, where="post", **curve)
         limit = float(data.tuning_mean_move_limit.sel(mv=CHOKE).values[0])
         mean.axhline(limit, color=style.BLACK, linestyle="--", linewidth=1.0, label=f"limit {limit:g} %")
         choke.set_title(f"{kind} MPC")
@@ -58,8 +54,7 @@ def opening(data: xr.Dataset) -> xr.Dataset:
     return data.isel(time=slice(start, start + length))
 
 
-def caption(data: xr.Dataset) -> str:
-    """The largest means."""
+def _caption(data: xr.Dataset) -> str:
     largest = key_figures(data).largest_mean_opening
     kinds = "; ".join(
         f"{kind} MPC {float(largest.sel(controller=f'{kind}-reactive')):.3f} and "
@@ -79,8 +74,7 @@ ENTRIES = (
         "mean-move",
         "mean_move",
         draw,
-        caption,
-        "Two columns, continuous and mixed-integer MPC: choke position above the windowed mean of its moves.",
+        _caption,
         tuple(f"{kind}-{mode}" for kind in KINDS for mode in MODES),
     ),
 )

@@ -12,11 +12,11 @@ from figures.thesis.plans import first_change
 from studies.definition.presets import CHOKE, GAS, LIFT, OIL
 
 CLOSED, OPEN = "closed-loop", "open-loop"
-CURVES = {CLOSED: ("closed loop", None), OPEN: ("open loop", style.PLAN)}
+CURVES = {CLOSED: {"label": "closed loop"}, OPEN: {"label": "open loop", "color": style.PLAN}}
 
 
 def compared(data: xr.Dataset, channels: tuple[str, str]) -> Figure:
-    """Two CVs or two MVs of both runs; `data` are the results of the study ``predictions``."""
+    """Two plots over time, each with an open-loop and a closed-loop curve."""
     drawn, axes = style.figure(2)
     seconds = panels.time_axis(axes[-1], *panels.span(data))
     for ax, channel in zip(axes, channels, strict=True):
@@ -27,13 +27,10 @@ def compared(data: xr.Dataset, channels: tuple[str, str]) -> Figure:
     return drawn
 
 
-def caption(data: xr.Dataset, channels: tuple[str, str]) -> str:
-    """Where each run ends."""
+def _caption(data: xr.Dataset, channels: tuple[str, str]) -> str:
     if channels == (OIL, GAS):
         off = settled(data, OPEN), settled(data, CLOSED)
-        (open_oil, open_gas), (oil, gas) = (
-            (style.signed(run[OIL], ".1f"), style.signed(run[GAS], ".0f")) for run in off
-        )
+        (open_oil, open_gas), (oil, gas) = ((f"{run[OIL]:+.1f}", f"{run[GAS]:+.0f}") for run in off)
         return (
             f"The plan carried out without feedback settles {open_oil} m³/h of oil and {open_gas} m³/h of gas off the "
             f"setpoints, the closed loop {oil} and {gas} m³/h."
@@ -53,13 +50,12 @@ ENTRIES = tuple(
         "predictions",
         f"figure_{id}_{kind}_open_loop",
         compared,
-        caption,
-        f"Two {plots} over time, {order}, each with an open-loop and a closed-loop curve.",
+        _caption,
         (CLOSED, OPEN),
         {"channels": channels},
     )
-    for id, kind, words, plots, order, channels in (
-        ("27", "rates", "oil and gas rate", "line plots", "oil rate above gas rate", (OIL, GAS)),
-        ("28", "inputs", "choke and gas lift", "step plots", "choke above gas lift", (CHOKE, LIFT)),
+    for id, kind, words, channels in (
+        ("27", "rates", "oil and gas rate", (OIL, GAS)),
+        ("28", "inputs", "choke and gas lift", (CHOKE, LIFT)),
     )
 )

@@ -28,18 +28,18 @@ PREDICTED = "closed-loop"  # the controller of figures 25 to 28
 
 
 def planned(data: xr.Dataset, controller: str) -> Figure:
-    """Figure 25: the plan made when the setpoints first change: rates, inputs and moves over the horizon.
+    """Six plots over time: rates, inputs and their moves; past on white, a plan with its prediction on grey.
 
     Args:
         data: results of the study ``predictions``.
-        controller: name of a run whose plans are stored.
+        controller: name of a run whose plans are stored; its plan when the setpoints first change is drawn.
     """
     plan = first_plan(data, controller)
     return _six_panels(data, controller, plan, known=plan.time)
 
 
 def evolved(data: xr.Dataset, controller: str) -> Figure:
-    """Figure 26: what the controller did after that change, and the first plan beside it; arguments of `planned`."""
+    """Six plots over time: rates, inputs and their moves; what happened, and the first plan dashed."""
     return _six_panels(data, controller, first_plan(data, controller), known=np.inf, grey=False, line="--")
 
 
@@ -53,7 +53,7 @@ def _six_panels(data: xr.Dataset, controller: str, plan: StoredPlan, **options: 
 
 
 def swing(data: xr.Dataset, controller: str, which: int) -> Figure:
-    """Figures 36, 37, 38: what a move of an oscillation was to bring, and what it brought.
+    """Four plots over time: oil and gas rate with prediction and response, choke and lift with the plan.
 
     Args:
         data: results of the study ``without-soft``.
@@ -67,7 +67,7 @@ def swing(data: xr.Dataset, controller: str, which: int) -> Figure:
     end = min(moves[2] + max(SWING[1], length), panels.span(data)[1])
     drawn, rows = style.grid(2, 2, 9.6, 4.5, sharex=True)
     draw_plan(rows, data, controller, plan, (start, end), known=np.inf)
-    size = style.signed(plan.move[0, index_of(data.mv, CHOKE)])
+    size = style.minus(f"{plan.move[0, index_of(data.mv, CHOKE)]:+g}")
     title = f"{WORDS[which]} turn: choke {size} % at {plan.time:,.0f} s"
     panels.shared_legend(drawn, rows.flat, title=title)
     return drawn
@@ -117,7 +117,7 @@ def draw_plan(
         panels.setpoint(ax, whole, cv, MINUTE)
         ax.plot(plan.cv_time[inside] / MINUTE, plan.cv[inside, index_of(data.cv, cv)], **look)
         for seen, _, label, strength in parts:
-            panels.measured(ax, seen, controller, cv, MINUTE, label, colour, alpha=strength)
+            panels.measured(ax, seen, controller, cv, MINUTE, label=label, alpha=strength)
     t = np.append(plan.move_time, [plan.move_time[-1] + plan.dt, plan.cv_time[-1]]) / MINUTE
     for column, mv in zip(rows[1:].T, panels.mv_names(data), strict=False):
         i = index_of(data.mv, mv)
@@ -166,8 +166,7 @@ def swing_moves(data: xr.Dataset, controller: str) -> tuple[float, float, float]
     return one, two, three
 
 
-def planned_caption(data: xr.Dataset, controller: str) -> str:
-    """Where the plan ends."""
+def _planned_caption(data: xr.Dataset, controller: str) -> str:
     plan = first_plan(data, controller)
     end = dict(zip(map(str, data.mv.values), plan.mv[-1], strict=True))
     off = _off_setpoint(data, plan, dict(zip(map(str, data.cv.values), plan.cv[-1], strict=True)))
@@ -175,13 +174,12 @@ def planned_caption(data: xr.Dataset, controller: str) -> str:
     minutes = (moving[-1] + 1) * plan.dt / 60 if moving.size else 0.0
     return (
         f"At the step of the setpoints the controller plans to bring the choke to {end[CHOKE]:.0f} % within {minutes:.1f} "
-        f"minutes and the lift to {end[LIFT]:.0f} m³/h, and expects to end {style.signed(off[OIL], '.1f')} m³/h of oil "
-        f"and {style.signed(off[GAS], '.0f')} m³/h of gas off the setpoints."
+        f"minutes and the lift to {end[LIFT]:.0f} m³/h, and expects to end {off[OIL]:+.1f} m³/h of oil "
+        f"and {off[GAS]:+.0f} m³/h of gas off the setpoints."
     )
 
 
-def evolved_caption(data: xr.Dataset, controller: str) -> str:
-    """Where the run is at the end of that plan."""
+def _evolved_caption(data: xr.Dataset, controller: str) -> str:
     plan = first_plan(data, controller)
     end = int(np.searchsorted(data.time.values, plan.cv_time[-1], side="right")) - 1
     run = data.sel(controller=controller).isel(time=end)
@@ -192,7 +190,7 @@ def evolved_caption(data: xr.Dataset, controller: str) -> str:
     )
     return (
         f"What followed: at the end of that horizon the choke stands at {choke} and the lift at {lift}, with oil "
-        f"{style.signed(off[OIL], '.1f')} and gas {style.signed(off[GAS], '.0f')} m³/h off the setpoints."
+        f"{off[OIL]:+.1f} and gas {off[GAS]:+.0f} m³/h off the setpoints."
     )
 
 
@@ -202,8 +200,7 @@ def _off_setpoint(data: xr.Dataset, plan: StoredPlan, cv: dict[str, float]) -> d
     return {name: value - float(row.sel(cv=name)) for name, value in cv.items()}
 
 
-def swing_caption(data: xr.Dataset, controller: str, which: int) -> str:
-    """What the oil rate was to do until the next turn, and what it did."""
+def _swing_caption(data: xr.Dataset, controller: str, which: int) -> str:
     moves = swing_moves(data, controller)
     plan = plan_at(data, controller, moves[which])
     until = moves[which + 1] if which < 2 else min(moves[2] + (moves[2] - moves[1]), plan.cv_time[-1])
@@ -213,13 +210,12 @@ def swing_caption(data: xr.Dataset, controller: str, which: int) -> str:
     start = run[k - j]
     expected, real = plan.cv[j - 1, index_of(data.cv, OIL)] - start, run[k] - start
     return (
-        f"The controller turns the choke back by {style.signed(plan.move[0, index_of(data.mv, CHOKE)])} % and expects the "
-        f"oil rate to change by {style.signed(expected, '.1f')} m³/h in the next {j * plan.dt:.0f} s; it changes by "
-        f"{style.signed(real, '.1f')} m³/h."
+        f"The controller turns the choke back by {plan.move[0, index_of(data.mv, CHOKE)]:+g} % and expects the "
+        f"oil rate to change by {expected:+.1f} m³/h in the next {j * plan.dt:.0f} s; it changes by "
+        f"{real:+.1f} m³/h."
     )
 
 
-_SIX = "Six plots over time: oil and gas rate, choke and gas lift, and the moves of both."
 ENTRIES = (
     FigureEntry(
         "25",
@@ -227,8 +223,7 @@ ENTRIES = (
         "predictions",
         "figure_25_plan",
         planned,
-        planned_caption,
-        f"{_SIX} The past is white; the plan and its prediction lie on grey.",
+        _planned_caption,
         (PREDICTED,),
         {"controller": PREDICTED},
     ),
@@ -238,8 +233,7 @@ ENTRIES = (
         "predictions",
         "figure_26_evolution",
         evolved,
-        evolved_caption,
-        f"{_SIX} What happened, and the plan of the step dashed.",
+        _evolved_caption,
         (PREDICTED,),
         {"controller": PREDICTED},
     ),
@@ -250,8 +244,7 @@ ENTRIES = (
             "without-soft",
             f"figure_{36 + which}_prediction_{which + 1}",
             swing,
-            swing_caption,
-            "Four plots over time: oil and gas rate with prediction and response, choke and lift with the plan.",
+            _swing_caption,
             ("no-soft",),
             {"controller": "no-soft", "which": which},
         )

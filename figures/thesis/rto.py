@@ -20,7 +20,10 @@ from studies.definition.presets import CHOKE, GAS, LIFT, OIL
 from studies.store.comparison import open_results, provenance
 
 PLAIN, TARGETED = "without-rto", "with-rto"
-CURVES = {PLAIN: ("without RTO", style.GREEN), TARGETED: ("with RTO", style.PURPLE)}
+CURVES = {
+    PLAIN: {"label": "without RTO", "color": style.GREEN},
+    TARGETED: {"label": "with RTO", "color": style.PURPLE},
+}
 FORBIDDEN = "#F6DDD3"
 SETTLED = 30  # samples at the end of a window whose mean is where the run has settled
 
@@ -43,7 +46,7 @@ def draw(data: xr.Dataset) -> Figure:
     for ax, mv in ((lift, LIFT), (choke, CHOKE)):
         panels.compared(ax, data, mv, CURVES, seconds)
         target = data.target.sel(controller=TARGETED, mv=mv)
-        panels.dashed(ax, data, target, seconds, "input target", CURVES[TARGETED][1])
+        panels.dashed(ax, data, target, seconds, "input target", CURVES[TARGETED]["color"])
         panels.limits(ax, data.position.sel(mv=mv), data.target.sel(mv=mv))
     _shade(lift, ranges)
     lift.set_ylim(bottom=0.0)
@@ -90,12 +93,17 @@ def _map(axes: Axes, data: xr.Dataset, ranges: list[list[float]]) -> None:
         label = f"steady {panels.label_of(data, cv)}"
         axes.plot([], [], color=colour, linewidth=0.7, linestyle=line, label=label)
     window = data.window.values
-    for (name, (words, colour)), mark, side in zip(CURVES.items(), "oD", (-1, 1), strict=True):
+    for (name, curve), mark, side in zip(CURVES.items(), "oD", (-1, 1), strict=True):
         run = data.position.sel(controller=name).values
         ends = np.array([run[window == w][-SETTLED:].mean(axis=0) for w in np.unique(window)])
-        look: dict[str, Any] = {"markersize": 7, "markeredgecolor": "white", "color": colour, "zorder": 4}
-        axes.plot(*ends.T, mark, label=f"settled, {words}", **look)
-        note = {"fontsize": 8.5, "weight": "bold", "color": colour, "va": "center", "zorder": 5}
+        look: dict[str, Any] = {
+            "markersize": 7,
+            "markeredgecolor": "white",
+            "color": curve["color"],
+            "zorder": 4,
+        }
+        axes.plot(*ends.T, mark, label=f"settled, {curve['label']}", **look)
+        note = {"fontsize": 8.5, "weight": "bold", "color": curve["color"], "va": "center", "zorder": 5}
         note |= {"xytext": (7 * side, 5 * side), "ha": "left" if side > 0 else "right"}
         for k, place in enumerate(ends):
             axes.annotate(str(k + 1), place, textcoords="offset points", **note)
@@ -111,9 +119,9 @@ def _rate(axes: Axes, data: xr.Dataset, cv: str, seconds: float) -> None:
     demanded = data.demanded.sel(cv=cv)
     half = float(data.tuning_deadzone.sel(cv=cv)[0])
     panels.band(axes, data, demanded, half, seconds, None)
-    for name, (_, colour) in CURVES.items():
-        panels.measured(axes, data, name, cv, seconds, "_measured", colour)
+    for name, curve in CURVES.items():
+        panels.measured(axes, data, name, cv, seconds, color=curve["color"], label="_measured")
     panels.dashed(axes, data, demanded, seconds, "demand and its deadzone")
     wanted = data.setpoint.sel(controller=TARGETED, cv=cv)
-    panels.dashed(axes, data, wanted, seconds, "setpoint of the RTO", CURVES[TARGETED][1])
+    panels.dashed(axes, data, wanted, seconds, "setpoint of the RTO", CURVES[TARGETED]["color"])
     panels.limits(axes, data.measurement.sel(cv=cv), demanded - half, demanded + half)

@@ -26,7 +26,9 @@ SHORTEST = 600.0  # s
 
 
 def rates(data: xr.Dataset, controller: str) -> Figure:
-    """Measured CVs with their setpoints and deadzones; limits that hold every controller in `data`.
+    """Oil rate above gas rate over time: measured, the setpoint dashed, and the deadzone if there is one.
+
+    Vertical limits hold every controller in `data`.
 
     Args:
         data: results, whole or a stretch of time or of controllers.
@@ -42,7 +44,7 @@ def rates(data: xr.Dataset, controller: str) -> Figure:
 
 
 def inputs(data: xr.Dataset, controller: str) -> Figure:
-    """Demanded and actual choke position, and the lift rate; arguments of `rates`."""
+    """Demanded and actual choke position above the gas-lift rate over time."""
     drawn, axes, seconds = _stack(data, controller, 2)
     for ax, mv in zip(axes, (CHOKE, LIFT), strict=True):
         panels.manipulated(ax, data, controller, mv, seconds, demand=mv == CHOKE)
@@ -52,7 +54,7 @@ def inputs(data: xr.Dataset, controller: str) -> Figure:
 
 
 def bias(data: xr.Dataset, controller: str) -> Figure:
-    """Filtered output bias of both CVs; arguments of `rates`."""
+    """Filtered output bias of the oil rate above that of the gas rate over time."""
     drawn, axes, seconds = _stack(data, controller, data.sizes["cv"])
     for ax, cv in zip(axes, panels.cv_names(data), strict=True):
         panels.bias(ax, data, controller, cv, seconds)
@@ -61,12 +63,12 @@ def bias(data: xr.Dataset, controller: str) -> Figure:
 
 
 def close_up_rates(data: xr.Dataset, controller: str) -> Figure:
-    """Figure 20: `rates` while the controller oscillates."""
+    """Oil rate above gas rate in the short stretch in which the controller oscillates most."""
     return rates(stretch(data, controller), controller)
 
 
 def close_up_inputs(data: xr.Dataset, controller: str) -> Figure:
-    """Figure 21: `inputs` while the controller oscillates."""
+    """Choke above gas lift in the short stretch in which the controller oscillates most."""
     return inputs(stretch(data, controller), controller)
 
 
@@ -113,8 +115,7 @@ def stretch(data: xr.Dataset, controller: str) -> xr.Dataset:
     return between(data.sel(controller=[controller]), start, end, closed=False)
 
 
-def rates_caption(data: xr.Dataset, controller: str) -> str:
-    """Deviations, and the reversals of all finished runs."""
+def _rates_caption(data: xr.Dataset, controller: str) -> str:
     run = data.sel(controller=controller)
     off = np.abs(run.measurement - run.setpoint).mean("time")
     others = ", ".join(
@@ -129,8 +130,7 @@ def rates_caption(data: xr.Dataset, controller: str) -> str:
     )
 
 
-def inputs_caption(data: xr.Dataset, controller: str) -> str:
-    """Travel of both MVs, and range of the choke."""
+def _inputs_caption(data: xr.Dataset, controller: str) -> str:
     run = data.sel(controller=controller)
     choke = run.position.sel(mv=CHOKE)
     return (
@@ -140,8 +140,7 @@ def inputs_caption(data: xr.Dataset, controller: str) -> str:
     )
 
 
-def bias_caption(data: xr.Dataset, controller: str) -> str:
-    """The largest biases."""
+def _bias_caption(data: xr.Dataset, controller: str) -> str:
     size = np.abs(data.bias.sel(controller=controller)).max("time")
     return (
         "What the linear model leaves unexplained of the measurements, filtered: up to "
@@ -150,8 +149,7 @@ def bias_caption(data: xr.Dataset, controller: str) -> str:
     )
 
 
-def close_up_rates_caption(data: xr.Dataset, controller: str) -> str:
-    """How far the rates swing."""
+def _close_up_rates_caption(data: xr.Dataset, controller: str) -> str:
     part = stretch(data, controller).sel(controller=controller)
     swing = part.measurement.max("time") - part.measurement.min("time")
     choke = part.position.sel(mv=CHOKE)
@@ -161,8 +159,7 @@ def close_up_rates_caption(data: xr.Dataset, controller: str) -> str:
     )
 
 
-def close_up_inputs_caption(data: xr.Dataset, controller: str) -> str:
-    """How often the choke reverses meanwhile."""
+def _close_up_inputs_caption(data: xr.Dataset, controller: str) -> str:
     part = stretch(data, controller)
     minutes = (part.time.values[-1] - part.time.values[0]) / 60
     return (
@@ -171,8 +168,7 @@ def close_up_inputs_caption(data: xr.Dataset, controller: str) -> str:
     )
 
 
-def without_soft_caption(data: xr.Dataset, controller: str) -> str:
-    """Figure 34: reversals with and without Soft MPC."""
+def _without_soft_caption(data: xr.Dataset, controller: str) -> str:
     count = {name: times(reversals(data, name)) for name in ("soft", controller, "no-soft-plain")}
     return (
         f"Without Soft MPC the choke reverses {count[controller]} over the run, with the extra penalty simply left out "
@@ -180,19 +176,15 @@ def without_soft_caption(data: xr.Dataset, controller: str) -> str:
     )
 
 
-RATES_ALT = "Two line plots over time, oil rate above gas rate: the measured rate, its setpoint dashed, and the deadzone."
-INPUTS_ALT = "Two step plots over time: demanded and actual choke position above the gas-lift rate."
-_BIAS_ALT = "Two line plots over time around zero: output bias of the oil rate above that of the gas rate."
-_HARD_ALT = "Two line plots over time, oil rate above gas rate: the measured rate and its setpoint dashed."
-_RATES = ("rates", "oil and gas rate", rates, rates_caption, RATES_ALT)
-_INPUTS = ("inputs", "choke and gas lift", inputs, inputs_caption, INPUTS_ALT)
-_BIAS = ("bias", "output bias", bias, bias_caption, _BIAS_ALT)
+_RATES = ("rates", "oil and gas rate", rates, _rates_caption)
+_INPUTS = ("inputs", "choke and gas lift", inputs, _inputs_caption)
+_BIAS = ("bias", "output bias", bias, _bias_caption)
 
 
 def _entries(
     controller: str, first: int, what: str, study: str, file: str, *kinds, needs: tuple[str, ...] = ()
 ):
-    """Successive figures of one controller; `kinds` are name, words, function, caption and description of each."""
+    """Successive figures of one controller; `kinds` are name, words, function and caption of each."""
     return [
         FigureEntry(
             str(first + i),
@@ -201,11 +193,10 @@ def _entries(
             f"figure_{first + i}_{kind}_{file}",
             function,
             caption,
-            alt,
             needs if needs and i == 0 else (controller,),
             {"controller": controller},
         )
-        for i, (kind, words, function, caption, alt) in enumerate(kinds)
+        for i, (kind, words, function, caption) in enumerate(kinds)
     ]
 
 
@@ -220,8 +211,8 @@ ENTRIES = (
         " while the rounded controller oscillates",
         "thesis",
         "oscillating",
-        (*_RATES[:2], close_up_rates, close_up_rates_caption, f"{RATES_ALT} A short stretch of the run."),
-        (*_INPUTS[:2], close_up_inputs, close_up_inputs_caption, f"{INPUTS_ALT} A short stretch of the run."),
+        (*_RATES[:2], close_up_rates, _close_up_rates_caption),
+        (*_INPUTS[:2], close_up_inputs, _close_up_inputs_caption),
     ),
     *_entries(INTEGER, 22, ": mixed-integer MPC", "thesis", "mixed_integer", _RATES, _INPUTS, _BIAS),
     *_entries(
@@ -230,7 +221,7 @@ ENTRIES = (
         ": mixed-integer MPC without Soft MPC",
         "without-soft",
         "without_soft",
-        (*_RATES[:3], without_soft_caption, _HARD_ALT),
+        (*_RATES[:3], _without_soft_caption),
         _INPUTS,
         needs=("soft", HARD, "no-soft-plain"),
     ),

@@ -22,22 +22,17 @@ REACH = 4.0  # deadzone half widths to show
 
 
 def compared(data: xr.Dataset) -> Figure:
-    """Figure 12: oil rate with setpoint and deadzone, and choke position, of both controllers.
-
-    Args:
-        data: results of the study ``soft``.
-    """
+    """Oil rate with setpoint and deadzone above the choke position, each with a curve per controller."""
     drawn, axes = style.figure(2, row_height=2.5)
     seconds = panels.time_axis(axes[1], *panels.span(data))
     for ax, channel in zip(axes, (OIL, CHOKE), strict=True):
-        curves = {NOMINAL: ("nominal", None), SOFT: ("Soft MPC", None)}
+        curves = {NOMINAL: {"label": "nominal"}, SOFT: {"label": "Soft MPC"}}
         panels.compared(ax, data, channel, curves, seconds, zone=SOFT)
     panels.legend_above(axes[0], 4)
     return drawn
 
 
-def compared_caption(data: xr.Dataset) -> str:
-    """How often each reverses the choke."""
+def _compared_caption(data: xr.Dataset) -> str:
     return (
         f"Without the deadzone the choke reverses {times(reversals(data, NOMINAL))} over the run, with Soft MPC "
         f"{times(reversals(data, SOFT))}: a small constant deviation of the oil rate is cheap, another move is not."
@@ -45,7 +40,7 @@ def compared_caption(data: xr.Dataset) -> str:
 
 
 def penalties(_results=None) -> Figure:
-    """Figure 13: penalty of one sample over the deviation, with the weights of the presets."""
+    """Two plots, oil above gas: three parabola-like penalties over the deviation, the deadzone shaded."""
     drawn, axes = style.figure(2, row_height=2.6, sharex=False)
     for ax, cv in zip(axes, (OIL, GAS), strict=True):
         unit = style.unit(CV_UNITS[CV_NAMES.index(cv)])
@@ -77,8 +72,7 @@ def cost(
     return weight * deviation**2 + quadratic * eta**2 + linear * eta
 
 
-def penalties_caption(_results=None) -> str:
-    """The ratio of both inside and far outside the deadzone."""
+def _penalties_caption(_results=None) -> str:
     half = TUNINGS["thesis"]["deadzone"][OIL]
     at = np.array([half, 10 * half])
     inside, outside = 100 * penalty("thesis", OIL, at) / penalty("no-soft", OIL, at)
@@ -95,8 +89,7 @@ ENTRIES = (
         "soft",
         "figure_12_nominal_and_soft",
         compared,
-        compared_caption,
-        "Oil rate with setpoint and deadzone above the choke position, each with a curve per controller.",
+        _compared_caption,
         (NOMINAL, SOFT),
     ),
     FigureEntry(
@@ -105,7 +98,6 @@ ENTRIES = (
         None,
         "figure_13_penalties",
         penalties,
-        penalties_caption,
-        "Two plots, oil above gas: three parabola-like penalties over the deviation, the deadzone shaded.",
+        _penalties_caption,
     ),
 )

@@ -1,28 +1,39 @@
-"""Thesis figure 39: time of every controller step over the run, continuous and mixed-integer MPC (chapter 8)."""
+"""Times of controller steps: thesis figure 39 (chapter 8), and the same and rates over batch sizes from a benchmark.
+
+`draw_benchmark` reads the JSON file of `jaxmpc bench --json`, or the same content in memory; nothing is measured here.
+"""
 
 from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from figures import benchmark
+from figures import style
 from figures.figure import FigureEntry
-from figures.thesis.facts import time_note
+from jaxmpc.errors import InputError
 
 MILLISECONDS = 1e3  # of a second
 TIMED = ("step-choke", "mixed-integer")
+RUN_NAME, BATCH_NAME = "figure_39_time_per_sample", "bench_rate_over_batch"
+DT_HOURS = 10.0 / 3600.0  # sampling interval of the thesis preset [h]
+MODES = ("moves", "inputs")
 
 
 def draw(data: xr.Dataset, controllers: tuple[str, ...]) -> Figure:
-    """One panel per controller, on one logarithmic axis.
+    """Scatter plots over time on a logarithmic axis, one per controller: milliseconds of each step.
 
     Args:
         data: results of the thesis study.
         controllers: names of finished runs of different kinds.
     """
     runs = [data.sel(controller=name) for name in controllers]
-    return benchmark.time_per_sample(
+    return time_per_sample(
         [
             (str(run.kind.item()), str(run.blocking.item()), MILLISECONDS * run.solve_time.values)
             for run in runs
@@ -30,8 +41,7 @@ def draw(data: xr.Dataset, controllers: tuple[str, ...]) -> Figure:
     )
 
 
-def caption(data: xr.Dataset, controllers: tuple[str, ...]) -> str:
-    """Median and longest time of each."""
+def _caption(data: xr.Dataset, controllers: tuple[str, ...]) -> str:
     parts = []
     for name in controllers:
         ms = MILLISECONDS * data.solve_time.sel(controller=name).values
@@ -43,6 +53,109 @@ def caption(data: xr.Dataset, controllers: tuple[str, ...]) -> str:
     )
 
 
+def time_note(data: xr.Dataset, controllers: Iterable[str]) -> str:
+    """What to know of times per sample where compiled loops have none of their own; empty otherwise."""
+    times = (data.solve_time.sel(controller=name).values for name in controllers)
+    if any(len(np.unique(run)) < data.sizes["time"] / 10 for run in times):
+        return " On the JAX well samples run compiled, many at once; each has their mean time."
+    return ""
+
+
+@style.house_style
+def draw_benchmark(results: str | Path | dict[str, Any], out: str | Path) -> list[Path]:
+    """Draw what the results have numbers for, as PNG and PDF.
+
+    Args:
+        results: JSON file of the benchmark, or its decoded content.
+        out: folder for the files.
+
+    Returns:
+        The files written; none if no section with a figure was measured.
+
+    Raises:
+        InputError: for a file that cannot be read.
+    """
+    body = results if isinstance(results, dict) else _load(Path(results))
+    series = body.get("series", {})
+    paths: list[Path] = []
+    runs = [
+        (*name.split()[1:], np.array(s["solve_ms"])) for name, s in series.items() if name.startswith("run ")
+    ]
+    if runs:
+        paths += style.save(time_per_sample(runs), out, RUN_NAME)
+    if any(name.startswith("batch ") for name in series):
+        paths += style.save(rate_over_batch(series), out, BATCH_NAME)
+    return paths
+
+
+def _load(path: Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(
+            "benchmark results", str(path), f"a file of `jaxmpc bench --json` ({error})"
+        ) from None
+
+
+def time_per_sample(runs: list[tuple[str, str, np.ndarray]]) -> Figure:
+    """One panel per run: solve time of every sample, its median, and the value that 99 % stay below.
+
+    Args:
+        runs: kind of the controller, blocking mode, and the times ``"sample"`` [ms].
+    """
+    drawn, axes = style.figure(len(runs), row_height=1.9, sharey=True)
+    for ax, (kind, mode, milliseconds) in zip(axes, runs, strict=True):
+        hours = np.arange(len(milliseconds)) * DT_HOURS
+        look: dict[str, Any] = {"markersize": 1.6, "color": style.colour(kind, "step"), "rasterized": True}
+        ax.plot(hours, milliseconds, ".", **look)
+        for percent, line, word in ((50, "-", "median"), (99, "--", "99 %")):
+            value = np.percentile(milliseconds, percent)
+            label = style.printed(f"{word}: {two_digits(value)} ms")
+            ax.axhline(value, color=style.BLACK, linewidth=0.9, linestyle=line, label=label)
+        ax.set_yscale("log")
+        ax.set_ylabel("time per sample [ms]")
+        ax.set_title(f"{kind} MPC, {mode}", loc="left")
+        ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.1)
+    axes[-1].set_xlabel("time [h]")
+    return drawn
+
+
+def two_digits(value: float) -> str:
+    """Two digits, and no power of ten for a hundred and more."""
+    return f"{value:,.0f}" if value >= 99.5 else f"{value:.2g}"
+
+
+def rate_over_batch(series: dict[str, Any]) -> Figure:
+    """Relaxed QPs per second over batch size, with and without a start, and the rate of the peer beside it.
+
+    Args:
+        series: of the results; ``batch MODE`` has ``batch``, ``warm``, ``cold`` and perhaps a peer's rate.
+    """
+    modes = [mode for mode in MODES if f"batch {mode}" in series]
+    drawn, axes = style.figure(len(modes), width=6.0, row_height=2.6, sharey=True)
+    for ax, mode in zip(axes, modes, strict=True):
+        rates = dict(series[f"batch {mode}"])
+        sizes = rates.pop("batch")
+        for name, rate in rates.items():
+            peer = style.BLACK, "--", f"{name}, one core", ""
+            colour, line, label, mark = _LINES.get(name, peer)
+            ax.plot(sizes[: len(rate)], rate, line, marker=mark, markersize=4, color=colour, label=label)
+        ax.set_xscale("log", base=2)
+        ax.set_yscale("log")
+        ax.set_xticks(sizes, [f"{count:g}" for count in sizes])
+        ax.set_ylabel("rate [QP/s]")
+        ax.set_title(f"relaxed QP, {mode}", loc="left")
+    axes[0].legend(loc="best")
+    axes[-1].set_xlabel("batch size [problems]")
+    return drawn
+
+
+_LINES = {
+    "warm": (style.BLUE, "-", "jaxmpc, started one sample earlier", "o"),
+    "cold": (style.ORANGE, "-", "jaxmpc, no start", "o"),
+}
+
+
 ENTRIES = (
     FigureEntry(
         "39",
@@ -50,8 +163,7 @@ ENTRIES = (
         "thesis",
         "figure_39_solve_time",
         draw,
-        caption,
-        "Two scatter plots over time on a logarithmic axis: milliseconds of each controller step.",
+        _caption,
         TIMED,
         {"controllers": TIMED},
     ),

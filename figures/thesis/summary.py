@@ -19,7 +19,7 @@ RULED = {"color": style.BLACK, "linewidth": 0.8}
 
 
 def draw(data: xr.Dataset) -> Figure:
-    """An A4 page across; `data` are the results of the thesis study."""
+    """Two tables on a page: key figures by controller, and statements of the thesis with a verdict each."""
     figures = key_figures(data)
     drawn, ((page,),) = style.grid(1, 1, 11.69, 8.27)
     drawn.set_layout_engine("none")
@@ -86,8 +86,7 @@ def _claims(page: Axes, said, top: float) -> None:
         page.plot([LEFT, RIGHT], [y, y], color="#DDDDDD", linewidth=0.5)
 
 
-def caption(data: xr.Dataset) -> str:
-    """What the page has."""
+def _caption(data: xr.Dataset) -> str:
     return (
         f"Key figures of the {data.sizes['controller']} runs, and statements of the thesis about this comparison with "
         "what our well shows and a verdict by a stated rule."
@@ -101,8 +100,7 @@ ENTRIES = (
         "thesis",
         "summary",
         draw,
-        caption,
-        "Two tables: key figures by controller, and statements of the thesis with a verdict each.",
+        _caption,
         ("continuous-choke", "step-choke", "mixed-integer"),
     ),
 )

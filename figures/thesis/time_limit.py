@@ -17,11 +17,7 @@ from studies.kpi.evaluate import key_figures
 
 
 def draw(data: xr.Dataset) -> Figure:
-    """Gaps of the steps that ended at the limit, then travel and deviation, per limit.
-
-    Args:
-        data: results of the study ``time-limit``.
-    """
+    """Three plots over the time limit: proven gaps of limited steps, choke travel, mean deviation of the oil rate."""
     figures = key_figures(data)
     names = [str(name) for name in figures.controller.values]
     limited = sorted((name for name in names if name != "exact"), key=_milliseconds)
@@ -84,7 +80,6 @@ ENTRIES = (
         draw,
         "A step that ends at its limit applies the best plan found so far. The gaps are what the search could prove by "
         "then, not what the plan lost.",
-        "Three plots over the time limit: proven gaps of limited steps, choke travel, mean deviation of the oil rate.",
         ("exact",),
     ),
 )

@@ -40,7 +40,7 @@ def bench(options: Options) -> int:
     report = run_bench(quick=options.quick, only=options.only, json_path=options.json, stopped=show)
     show(report)
     if options.figures is not None:
-        from figures.benchmark import draw_benchmark
+        from figures.thesis.solve_time import draw_benchmark
 
         for path in draw_benchmark(json.loads(report.to_json()), options.figures):
             print(path, file=sys.stderr)

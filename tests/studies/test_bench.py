@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from figures.benchmark import draw_benchmark
+from figures.thesis.solve_time import draw_benchmark
 from identify.step_test import identify_step_response
 from jaxmpc.cli import main as cli
 from jaxmpc.cli.options import parser as make_parser
