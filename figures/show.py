@@ -37,12 +37,7 @@ class Panels(np.ndarray):
 
 
 @style.house_style
-def plot(
-    thing: Any,
-    *,
-    tuning: Tuning | None = None,
-    structure: Any = None,
-) -> Panels:
+def plot(thing: Any, *, tuning: Tuning | None = None, structure: Any = None) -> Panels:
     """Draw something; numbers as they are, units where they are known.
 
     Args:

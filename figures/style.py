@@ -36,12 +36,7 @@ SPARE_COLOURS = (PURPLE, ORANGE, SKY)
 TUNING_COLOURS = {"no-soft": PURPLE, "no-soft-plain": SKY}
 PLAN = ORANGE  # what a controller intends: plans and predictions, and the run that only carries one out
 SERIES = ((BLUE, "-"), (ORANGE, "--"), (GREEN, "-."))  # three curves of one kind
-VERDICT_COLOURS = {
-    "holds": GREEN,
-    "holds in part": ORANGE,
-    "does not hold": VERMILLION,
-    "not tested": GREY,
-}
+VERDICT_COLOURS = {"holds": GREEN, "holds in part": ORANGE, "does not hold": VERMILLION, "not tested": GREY}
 
 NAMES = {"gas_rate": "gas rate", "oil_rate": "oil rate", "choke": "choke", "gas_lift": "gas lift"}
 

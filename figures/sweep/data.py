@@ -33,21 +33,13 @@ UNEVEN = 4.0  # beyond it on both scales, values are drawn at equal distances
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SweepAxis:
-    """Something that varies between the scenarios.
+    """Something that varies between the scenarios."""
 
-    Attributes:
-        key: of the column; of the first one for columns that move together.
-        label: in words.
-        unit: "1" without unit, "" for text.
-        values: one per scenario, numbers or text.
-        linked: keys of the columns that move with it, one to one.
-    """
-
-    key: str
+    key: str  # of the column; of the first one for columns that move together
     label: str
-    unit: str
-    values: np.ndarray
-    linked: tuple[str, ...] = ()
+    unit: str  # "1" without unit, "" for text
+    values: np.ndarray  # "scenario", numbers or text
+    linked: tuple[str, ...] = ()  # keys of the columns that move with it, one to one
 
     @property
     def numeric(self) -> bool:
@@ -248,17 +240,11 @@ def controllers(data: xr.Dataset) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Variant:
-    """Scenarios that differ only in what no controller chooses.
+    """Scenarios that differ only in what no controller chooses."""
 
-    Attributes:
-        label: what sets them apart from other variants.
-        colour: of the controller, the same in every figure.
-        rows: positions of its scenarios.
-    """
-
-    label: str
-    colour: str
-    rows: np.ndarray
+    label: str  # what sets them apart from other variants
+    colour: str  # of the controller, the same in every figure
+    rows: np.ndarray  # positions of its scenarios
 
 
 def variants(data: xr.Dataset, axes: list[SweepAxis]) -> list[Variant]:

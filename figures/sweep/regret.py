@@ -26,23 +26,14 @@ SHIFTS = np.array([(r * dx, r * dy) for r in (7, 13, 20, 28, 38, 50, 65, 80) for
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Blocking:
-    """One blocking over all its runs.
+    """One blocking over all its runs."""
 
-    Attributes:
-        mode: meaning of a block.
-        blocks: how many.
-        horizon: prediction horizon [samples].
-        unknowns: moves that are decided at each sample, of all MVs.
-        rows: positions of its scenarios.
-        thesis: whether it is the blocking of the thesis.
-    """
-
-    mode: str
+    mode: str  # meaning of a block
     blocks: int
-    horizon: int
-    unknowns: int
-    rows: np.ndarray
-    thesis: bool
+    horizon: int  # of the prediction [samples]
+    unknowns: int  # moves that are decided at each sample, of all MVs
+    rows: np.ndarray  # positions of its scenarios
+    thesis: bool  # whether it is the blocking of the thesis
 
     @property
     def label(self) -> str:

@@ -146,12 +146,5 @@ ENTRIES = (
             (first + 1, "choke and gas lift", inputs, _inputs_caption),
         )
     ),
-    FigureEntry(
-        "33",
-        "the disturbance",
-        "disturbance",
-        "figure_33_pressure",
-        pressure,
-        _pressure_caption,
-    ),
+    FigureEntry("33", "the disturbance", "disturbance", "figure_33_pressure", pressure, _pressure_caption),
 )

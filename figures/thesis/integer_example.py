@@ -154,19 +154,7 @@ ENTRIES = (
         _optima_caption,
     ),
     FigureEntry(
-        "4",
-        "convex hull of the integer points",
-        None,
-        "figure_4_convex_hull",
-        convex_hull,
-        _hull_caption,
+        "4", "convex hull of the integer points", None, "figure_4_convex_hull", convex_hull, _hull_caption
     ),
-    FigureEntry(
-        "5",
-        "a valid inequality",
-        None,
-        "figure_5_valid_inequality",
-        valid_inequality,
-        _cut_caption,
-    ),
+    FigureEntry("5", "a valid inequality", None, "figure_5_valid_inequality", valid_inequality, _cut_caption),
 )
