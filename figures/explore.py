@@ -22,7 +22,8 @@ from figures.sweep.wear import front
 from figures.thesis.plans import BEFORE, draw_plan
 from jaxmpc.errors import InputError
 from studies.kpi.evaluate import completed, key_figures
-from studies.store.comparison import RESULTS, open_results
+from studies.store.files import RESULTS
+from studies.store.reading import open_results
 from studies.thesis.plans import plan_at
 
 X, Y = "travel", "deviation"  # columns of `points`, [%] and [1]

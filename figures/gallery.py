@@ -19,7 +19,7 @@ from figures.registry import FIGURES, check_ids
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
 from studies.definition.comparison import PLANTS, PlantKind
-from studies.store.comparison import open_results
+from studies.store.reading import open_results
 
 PAGE = "index.html"
 TEMPLATE = Path(__file__).with_name("gallery.html")

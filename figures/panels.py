@@ -1,6 +1,6 @@
 """Panels that several figures share: a CV with its setpoint, an MV, a bias, several runs; on one axes each.
 
-`data` are results as `studies.store.comparison.open_results` gives them, or `figures.closed_loop.results` of one run.
+`data` are results as `studies.store.reading.open_results` gives them, or `figures.closed_loop.results` of one run.
 `seconds` is the unit of the time axis, as `time_axis` returns it.
 """
 

@@ -9,7 +9,7 @@ from figures.registry import FIGURES, check_ids, draw
 from jaxmpc.errors import InputError
 from studies.definition.comparison import PLANTS, PlantKind
 from studies.run.comparison import is_current as stored_as
-from studies.store.comparison import check_writable
+from studies.store.writing import check_writable
 from studies.thesis import catalogue
 
 

@@ -29,7 +29,7 @@ from figures.thesis import (
 )
 from jaxmpc.errors import InputError
 from studies.kpi.evaluate import completed
-from studies.store.comparison import open_results
+from studies.store.reading import open_results
 
 _NUMBERED = (integer_example, coefficients, soft, runs, plans, open_loop, events, solve_time)
 _NAMED = (summary, unblocked, gain_scheduling, mean_move, time_limit)

@@ -21,7 +21,7 @@ from jaxmpc.errors import InputError
 from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.problem.tuning import Tuning
 from studies.kpi.evaluate import completed
-from studies.store.comparison import open_results
+from studies.store.reading import open_results
 
 
 class Panels(np.ndarray):

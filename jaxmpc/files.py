@@ -1,21 +1,53 @@
 """Files that are written, the one place where that happens: a regular file is replaced in one go or not at all, a link
 is followed, a pipe or a character device is written to. `check_target` refuses beforehand what could not be written.
+`strict_json` is how numbers that JSON has no word for stand in them.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import os
 import secrets
 import stat
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from jaxmpc.errors import InputError
 
 Content = str | bytes | Callable[[str], object]
+NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}  # numbers that JSON has no word for
+
+
+def strict_json(value: Any) -> Any:
+    """JSON-like values and arrays in what every JSON reader takes: numbers that are not finite become the texts of
+    `NOT_FINITE`, arrays nested lists. A text that is one of these words itself gets an apostrophe before it.
+    """
+    if isinstance(value, Mapping):
+        return {str(key): strict_json(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [strict_json(entry) for entry in value]
+    if isinstance(value, str):
+        return f"'{value}" if value.lstrip("'") in NOT_FINITE else value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    return value if value is None or isinstance(value, int) else strict_json(np.asarray(value).tolist())
+
+
+def from_strict_json(value: Any) -> Any:
+    """What `strict_json` was given, with arrays as lists."""
+    if isinstance(value, dict):
+        return {key: from_strict_json(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [from_strict_json(entry) for entry in value]
+    if isinstance(value, str) and value.lstrip("'") in NOT_FINITE:
+        return NOT_FINITE.get(value, value[1:])
+    return value
 
 
 def write_atomically(path: str | Path, content: Content) -> Path:

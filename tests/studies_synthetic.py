@@ -1,12 +1,20 @@
 """Made-up closed loops of the thesis's shape, to test stores, key figures and plots without solving."""
 
+import tempfile
+from pathlib import Path
+
 import numpy as np
 import xarray as xr
 
 from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.model.step_response import make_model
 from studies.definition.comparison import ComparisonDefinition, ReferenceDefinition
-from studies.run.comparison import comparison_template
+from studies.run.comparison import comparison_layout
+from studies.store.files import RESULTS
+from studies.store.layout import StoreLayout
+from studies.store.reading import open_results
+from studies.store.trajectories import run_fields
+from studies.store.writing import Store
 from studies.thesis.catalogue import STUDIES
 
 DT = 10.0
@@ -56,13 +64,38 @@ def extra() -> dict[str, xr.DataArray]:
     }
 
 
-def template(
-    study_hash="study", hashes=("a", "b", "c"), of: ComparisonDefinition | None = None
-) -> xr.Dataset:
+def layout(
+    study_hash="study", hashes=("a", "b", "c"), of: ComparisonDefinition | None = None, code=None
+) -> StoreLayout:
+    """The store of the comparison."""
+    facts = {"kind": "jax"}, {"jaxmpc": "none"} if code is None else code
+    return comparison_layout(of or definition(), model(), extra, list(hashes), study_hash, *facts)
+
+
+def begin(folder, given: StoreLayout | None = None, say=lambda line: None) -> Store:
+    """Its store, made if it is not there."""
+    return Store.begin(folder / RESULTS, given or layout(), say, lock=False)
+
+
+def write(store: Store, name: str, run: Trajectory, wall_time: float = 1.0) -> None:
+    """Store the run of a controller."""
+    given = store.layout
+    store.commit(given.names.index(name), run_fields(run, wall_time, given.lengths["block"]), {})
+
+
+def stored(folder) -> Path:
+    """A store with all of `RUNS`."""
+    store = begin(folder)
+    for name, kind in RUNS.items():
+        write(store, name, trajectory(kind))
+    return folder
+
+
+def empty(given: StoreLayout | None = None) -> xr.Dataset:
     """The results before any run."""
-    return comparison_template(
-        of or definition(), model(), extra(), list(hashes), study_hash, {"kind": "jax"}, {"jaxmpc": "none"}
-    )
+    with tempfile.TemporaryDirectory() as folder:
+        begin(Path(folder), given)
+        return open_results(folder).load()
 
 
 def trajectory(kind: str, samples: int = 400) -> Trajectory:

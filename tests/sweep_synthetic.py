@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from studies.store.layout import Column, StoreLayout, Variable, digest
-from studies.store.sweep import SweepStore
+from studies.store.fingerprint import content_hash
+from studies.store.layout import Column, StoreLayout, Variable
+from studies.store.writing import Store
 
 DEADZONE = ("tuning.deadzone.gas_rate", "deadzone of the gas rate", "m3/h")
 OIL_DEADZONE = ("tuning.deadzone.oil_rate", "deadzone of the oil rate", "m3/h")
@@ -72,7 +73,7 @@ def write(
         study_hash="made-up",
         chunk_size=chunk_size,
         chunk_scenarios=tuple(np.arange(i, min(i + chunk_size, count)) for i in range(0, count, chunk_size)),
-        scenario_hashes=tuple(digest(k) for k in range(count)),
+        scenario_hashes=tuple(content_hash(k) for k in range(count)),
         columns=tuple(columns),
         variables=KEY_FIGURES + (TRAJECTORIES if trajectories else ()),
         coords={
@@ -85,7 +86,7 @@ def write(
         provenance={**(provenance or {}), **({"definition": definition} if definition is not None else {})},
     )
     fields = {**figures, **(trajectories or {})}
-    with SweepStore.begin(path, layout, lambda line: None) as store:
+    with Store.begin(path, layout, lambda line: None) as store:
         for i, rows in enumerate(layout.chunk_scenarios):
             if i not in skip:
                 store.commit(i, {name: v[rows] for name, v in fields.items()}, {"wall_time": 1.0})

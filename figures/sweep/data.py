@@ -17,9 +17,8 @@ from figures import style
 from jaxmpc.errors import InputError
 from studies.definition.fields import FIELDS, as_text
 from studies.definition.presets import TUNINGS
-from studies.store.comparison import provenance
 from studies.store.layout import FLAG
-from studies.store.reading import open_study
+from studies.store.reading import open_study, provenance
 
 CONTROLLER = ("controller", "actuator")
 STRUCTURE = ("blocking", "blocks", "prediction_horizon", "control_horizon")

@@ -14,7 +14,7 @@ from figures.thesis import runs
 from figures.thesis.facts import between, settled
 from jaxmpc.errors import InputError
 from studies.definition.presets import CHOKE, GAS, LIFT, OIL
-from studies.store.comparison import provenance
+from studies.store.reading import provenance
 
 INTEGER = "mixed-integer"
 When = Callable[[xr.Dataset, str], float]

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from figures import panels, style
 from jaxmpc.errors import InputError
 from studies.definition.presets import CHOKE, GAS, LIFT, OIL
-from studies.store.comparison import open_results, provenance
+from studies.store.reading import open_results, provenance
 
 PLAIN, TARGETED = "without-rto", "with-rto"
 CURVES = {

@@ -94,7 +94,7 @@ def _study_comparison(options: Options) -> int:
 
 
 def _study_sweep(options: Options) -> int:
-    from studies.definition.scenarios import load_study
+    from studies.load import load_study
 
     confirmed = bool(options.dry_run or options.yes)
     try:
@@ -205,7 +205,7 @@ def simulate(options: Options) -> int:
     check_folder("--out", options.out)
     import warnings
 
-    from studies.run.rerun import rerun
+    from studies.rerun import rerun
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)

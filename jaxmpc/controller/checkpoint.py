@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,13 +20,12 @@ from jaxmpc.controller.mixed_integer import MixedIntegerController
 from jaxmpc.controller.schedule import ModelSchedule, ScheduledController, ScheduledMixedIntegerController
 from jaxmpc.controller.targets import TargetController
 from jaxmpc.errors import InputError
-from jaxmpc.files import write_atomically
+from jaxmpc.files import from_strict_json, strict_json, write_atomically
 from jaxmpc.model.step_response import StepResponseModel, make_model
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import CV_FIELDS, Tuning, make_tuning
 
 FORMAT = "jaxmpc/controller/1"
-NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}  # numbers that JSON has no word for
 
 Controller = (
     ContinuousController
@@ -60,7 +58,9 @@ def save_controller(controller: Controller, path: str | Path, state: ControllerS
         The path written.
     """
     parts = _parts(controller)
-    tuning = {field.name: _plain(getattr(parts.tuning, field.name)) for field in dataclasses.fields(Tuning)}
+    tuning = {
+        field.name: strict_json(getattr(parts.tuning, field.name)) for field in dataclasses.fields(Tuning)
+    }
     body = {
         "format": FORMAT,
         "kind": parts.kind,
@@ -68,7 +68,7 @@ def save_controller(controller: Controller, path: str | Path, state: ControllerS
         "tuning": tuning,
         "model": parts.model.to_dict(),
         "options": parts.options,
-        "state": None if state is None else {name: _plain(leaf) for name, leaf in _named(state).items()},
+        "state": None if state is None else {name: strict_json(leaf) for name, leaf in _named(state).items()},
     }
     return write_atomically(path, json.dumps(body, allow_nan=False))
 
@@ -193,28 +193,17 @@ def _named(state: ControllerState) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
-    """An array as nested lists; JSON's numbers are read back to the last bit."""
-    if isinstance(value, list):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else str(value)
-    return value if isinstance(value, (bool, int)) else _plain(np.asarray(value).tolist())
-
-
 def _numbers(path: str, given: Any) -> np.ndarray:
     """The array of nested lists."""
 
     def number(value: Any) -> Any:
         if isinstance(value, list):
             return [number(entry) for entry in value]
-        if isinstance(value, str):
-            value = NOT_FINITE.get(value)
         if not isinstance(value, (bool, int, float)):
             raise InputError(path, given, "numbers in nested lists")
         return value
 
     try:
-        return np.array(number(given))
+        return np.array(number(from_strict_json(given)))
     except ValueError:
         raise InputError(path, given, "lists of equal length") from None

@@ -13,40 +13,26 @@ import msgspec
 import numpy as np
 
 from jaxmpc.errors import InputError
-from jaxmpc.loop.reference import Reference
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
 from studies.definition import presets
+from studies.definition.sections import ReferenceDefinition as ReferenceDefinition
 
 PlantKind = Literal["fmu", "jax"]
 PLANTS: tuple[PlantKind, ...] = ("fmu", "jax")
 
 
-class ReferenceDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Setpoints over time; see `jaxmpc.loop.reference.Reference`.
+def held_offsets(steps: np.ndarray, samples: int, dt: float) -> np.ndarray:
+    """Offsets ``"sample"`` that hold from one step to the next, 0 before the first.
 
-    Attributes:
-        times: change times [s].
-        setpoints: one row per change, in CV order [CV unit].
-        duration: length of the run [s].
+    Args:
+        steps: ``"step 2"``, increasing times [s] and the offset from then on; a step counts from the first sample that
+            starts at its time or later.
+        samples: of the run.
+        dt: sampling interval [s].
     """
-
-    times: tuple[float, ...]
-    setpoints: tuple[tuple[float, ...], ...]
-    duration: float
-
-    @classmethod
-    def of(cls, reference: Reference) -> ReferenceDefinition:
-        """The definition of an existing reference."""
-        return cls(
-            tuple(reference.times.tolist()),
-            tuple(tuple(row) for row in reference.setpoints.tolist()),
-            reference.duration,
-        )
-
-    def build(self) -> Reference:
-        """The checked reference."""
-        return Reference(self.times, self.setpoints, self.duration)
+    place = np.searchsorted(steps[:, 0], (np.arange(samples) + 1e-9) * dt, side="right")
+    return np.concatenate([[0.0], steps[:, 1]])[place]
 
 
 class TuningChange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -198,10 +184,8 @@ class ComparisonDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
 
     def offsets(self, dt: float) -> np.ndarray:
         """Reservoir-pressure offset at every sample of `dt` [s], ``"sample"`` [bar]."""
-        time = np.arange(self.reference.build().samples(dt)) * dt
-        starts = np.array([start for start, _ in self.disturbance])
-        index = np.searchsorted(starts, time + 1e-9 * dt, side="right")
-        return np.array([0.0, *(offset for _, offset in self.disturbance)])[index]
+        steps = np.array(self.disturbance, dtype=float).reshape(-1, 2)
+        return held_offsets(steps, self.reference.build().samples(dt), dt)
 
     def check(self) -> None:
         """Build everything once, so that bad values are refused before a run.
@@ -226,12 +210,6 @@ class ComparisonDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
             if structure.dt != first.dt:
                 raise InputError(
                     f"controllers.{controller.name}.dt", structure.dt, f"{first.dt} s like the others"
-                )
-            if reference.cv_count != structure.cv_count:
-                raise InputError(
-                    "reference.setpoints",
-                    f"{reference.cv_count} columns",
-                    f"{structure.cv_count} columns, one per CV ({', '.join(structure.cv_names)})",
                 )
         if reference.samples(first.dt) < 1:
             raise InputError("reference.duration", reference.duration, f"at least one sample of {first.dt} s")

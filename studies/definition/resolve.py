@@ -25,7 +25,7 @@ from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES, WellParameters, ch
 from studies.definition import presets, references
 from studies.definition.axes import AxisTable
 from studies.definition.fields import FIELDS, PLANT_FIELDS, SHIPPED, plant_si
-from studies.definition.sections import InlineReference
+from studies.definition.sections import ReferenceDefinition
 from studies.definition.sweep import StudyDefinition
 
 _NAMES_OF = {"cv": CV_NAMES, "mv": MV_NAMES, "": ("",)}
@@ -211,7 +211,7 @@ def _structure(settings: Settings, k: int) -> Structure:
 
 def _reference(settings: Settings, k: int, name: Any, duration: float | None) -> Reference:
     """A named or own reference, cut to a duration [s]; changes that the run would not reach are left out."""
-    whole = name.build() if isinstance(name, InlineReference) else references.NAMED[name]()
+    whole = name.build("base.") if isinstance(name, ReferenceDefinition) else references.NAMED[name]()
     if duration is None or duration == whole.duration:
         return whole
     if not 0 < duration <= whole.duration:

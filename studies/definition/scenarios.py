@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -25,9 +24,10 @@ from jaxmpc.problem.tuning import Tuning, make_tuning
 from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES, WellParameters
 from studies.definition import models
 from studies.definition.axes import AxisTable, expand_axes
+from studies.definition.comparison import held_offsets
+from studies.definition.estimate import MODEL_SECONDS, Work, chunk_seconds, megabytes
 from studies.definition.resolve import Inputs, Variant, resolve, row
-from studies.definition.sweep import StudyDefinition, load_definition
-from studies.run.estimate import MODEL_SECONDS, Work, chunk_seconds, megabytes
+from studies.definition.sweep import StudyDefinition
 from studies.store import fingerprint
 from studies.store.layout import Column
 
@@ -132,6 +132,7 @@ class Description:
         samples: samples of all scenarios together.
         stored_bytes: key figures and trajectories before compression [B].
         seconds: rough time on 2 CPU cores [s]: identification, and what the table of `estimate` says of the chunks.
+        searched: whether each chunk is a batch that is asked for after the one before.
     """
 
     name: str
@@ -143,15 +144,19 @@ class Description:
     samples: int
     stored_bytes: int
     seconds: float
+    searched: bool = False
 
     def __str__(self) -> str:
         sizes = ", ".join(str(size) for size in self.group_sizes[:12])
         more = ", ..." if len(self.group_sizes) > 12 else ""
+        batches = f"{self.chunks} batches of {self.scenarios // self.chunks} scenarios"
         return "\n".join(
             (
                 f"study       {self.name}",
                 f"scenarios   {self.scenarios} ({self.samples} samples in all)",
-                f"groups      {len(self.group_sizes)} of equal structure and length, of {sizes}{more} scenarios",
+                f"search      {batches}, each asked after the one before"
+                if self.searched
+                else f"groups      {len(self.group_sizes)} of equal structure and length, of {sizes}{more} scenarios",
                 f"chunks      {self.chunks}",
                 f"to compile  {self.compilations}",
                 f"models      {self.models} to identify",
@@ -163,7 +168,7 @@ class Description:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Study:
-    """All scenarios of a definition; made by `load_study` or `StudyDefinition.expand`, checked when it exists.
+    """All scenarios of a definition; made by `studies.load`, checked when it exists.
 
     Attributes:
         definition: as written, quick cuts applied.
@@ -304,13 +309,11 @@ class Study:
         return self._inputs.variants[self._inputs.variant[k]]
 
     def _disturbance(self, k: int) -> np.ndarray | None:
-        """Offsets "sample" [bar]; a step counts from the first sample that starts at its time or later."""
+        """Offsets "sample" [bar]."""
         steps, variant = row(self._inputs.pressure, k), self._variant(k)
         if not steps[:, 1].any():
             return None
-        now = np.arange(variant.samples) * variant.structure.dt
-        place = np.searchsorted(steps[:, 0], now + 1e-9 * variant.structure.dt, side="right")
-        return np.concatenate([[0.0], steps[:, 1]])[place]
+        return held_offsets(steps, variant.samples, variant.structure.dt)
 
     def _faults(self, k: int) -> np.ndarray | None:
         """Errors of the sensors "sample cv" [CV unit]."""
@@ -347,8 +350,8 @@ def code_hash() -> str:
     return fingerprint.content_hash(packages, modules, models.STEPS, models.SAMPLES)
 
 
-def expand(definition: StudyDefinition, *, confirmed: bool = False) -> Study:
-    """Expand a definition; see `StudyDefinition.expand`.
+def expand_sweep(definition: StudyDefinition, *, confirmed: bool = False) -> Study:
+    """Expand a definition without ``[search]``; see `studies.load.expand`.
 
     What is guaranteed: every scenario has a structure, tuning, well, working point, reference and disturbance that the typed
     objects accept, also in combination. What only a simulation shows, such as a well that does not settle, is not.
@@ -377,23 +380,6 @@ def default_chunk_size(scenarios: int) -> int:
     it the chunks and the compiled programs.
     """
     return 2 ** min(max(scenarios // CHUNKS, 1).bit_length() - 1, 6)
-
-
-def load_study(name_or_path: str | Path, *, quick: bool = False, confirmed: bool = False) -> Any:
-    """Read a definition (`definition.load_definition`) and expand it.
-
-    Args:
-        name_or_path: a shipped study or a file.
-        quick: the quick version.
-        confirmed: accept more scenarios than ``study.confirmation_limit``.
-
-    Returns:
-        `Study`, or a `search_study.SearchStudy` where the definition has ``[search]``.
-
-    Raises:
-        InputError: naming the path of the field, before anything is computed.
-    """
-    return load_definition(name_or_path).expand(quick=quick, confirmed=confirmed)
 
 
 def _columns(table: AxisTable) -> tuple[Column, ...]:

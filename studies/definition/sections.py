@@ -165,23 +165,39 @@ class FaultSection(Section, frozen=True):
     size: float = 0.0
 
 
-class InlineReference(Section, frozen=True):
-    """``[base.reference]``: setpoints of the study's own, as in `jaxmpc.loop.reference.Reference`."""
+class ReferenceDefinition(Section, frozen=True):
+    """``[base.reference]`` and the setpoints of a comparison; see `jaxmpc.loop.reference.Reference`.
+
+    Attributes:
+        times: change times [s].
+        setpoints: one row per change, in CV order [CV unit].
+        duration: length of the run [s].
+    """
 
     times: tuple[float, ...]
     setpoints: tuple[tuple[float, ...], ...]
     duration: float
 
-    def build(self) -> Reference:
-        """The reference, or an `InputError` with the path in the file."""
+    @classmethod
+    def of(cls, reference: Reference) -> ReferenceDefinition:
+        """The definition of an existing reference."""
+        setpoints = tuple(tuple(row) for row in reference.setpoints.tolist())
+        return cls(tuple(reference.times.tolist()), setpoints, reference.duration)
+
+    def build(self, place: str = "") -> Reference:
+        """The checked reference.
+
+        Args:
+            place: of ``reference`` in the definition, for errors, such as ``base.``.
+
+        Raises:
+            InputError: with the path in the definition.
+        """
         try:
             reference = Reference(self.times, self.setpoints, self.duration)
         except InputError as error:
-            raise InputError(f"base.{error.field}", error.value, error.expected, error.hint) from None
+            raise InputError(f"{place}{error.field}", error.value, error.expected, error.hint) from None
         if reference.cv_count != len(CV_NAMES):
-            raise InputError(
-                "base.reference.setpoints",
-                f"{reference.cv_count} columns",
-                f"one per CV: {', '.join(CV_NAMES)} [m3/h]",
-            )
+            found, expected = f"{reference.cv_count} columns", f"one per CV: {', '.join(CV_NAMES)} [m3/h]"
+            raise InputError(f"{place}reference.setpoints", found, expected)
         return reference

@@ -26,10 +26,10 @@ from studies.definition.sections import (
     Axis,
     Cut,
     FaultSection,
-    InlineReference,
     PressureStep,
     Quick,
     Range,
+    ReferenceDefinition,
     Sampling,
     Search,
     Store,
@@ -48,7 +48,7 @@ class StudyDefinition:
         study, axes, sampling, store, quick: the sections of the file.
         search: what is sought along the axes; None for a study that lists its scenarios.
         base: settings by key (`fields.FIELDS`), only those that are given; besides, ``reference`` may be an
-            `InlineReference`, ``disturbance`` is a tuple of `PressureStep` and ``sensor_fault`` one of `FaultSection`.
+            `ReferenceDefinition`, ``disturbance`` is a tuple of `PressureStep` and ``sensor_fault`` one of `FaultSection`.
         places: path of every axis in the file, for errors.
         folder: that CSV files are relative to.
         body: content of the file, from which `from_dict` makes the same definition again.
@@ -163,25 +163,6 @@ class StudyDefinition:
             search=search,
         )
 
-    def expand(self, *, quick: bool = False, confirmed: bool = False) -> Any:
-        """All scenarios, checked: a `studies.definition.scenarios.Study`; nothing is simulated.
-
-        A definition with ``[search]`` becomes a `studies.search.study.SearchStudy`.
-
-        Args:
-            quick: the quick version.
-            confirmed: accept more scenarios than ``study.confirmation_limit``.
-
-        Raises:
-            InputError: naming the path of the field.
-        """
-        if self.search is not None:
-            from studies.search.study import expand_search as expand
-        else:
-            from studies.definition.scenarios import expand
-
-        return expand(self.cut() if quick else self, confirmed=confirmed)
-
 
 def load_definition(name_or_path: str | Path) -> StudyDefinition:
     """Read a shipped definition by name (see `shipped_studies`), or any file by its path.
@@ -252,8 +233,8 @@ def settings(body: Any, path: str) -> dict[str, Any]:
             if key in _EVENTS:
                 out[key] = _events(value, key, where)
             elif key == "reference" and isinstance(value, dict):
-                out[key] = _convert(value, InlineReference, where)
-                out[key].build()
+                out[key] = _convert(value, ReferenceDefinition, where)
+                out[key].build(f"{path}.")
             elif key in FIELDS:
                 out[key] = FIELDS[key].check(where, value)
             elif below and isinstance(value, dict):

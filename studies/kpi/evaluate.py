@@ -5,16 +5,18 @@ from __future__ import annotations
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from jaxtyping import Array
 
+from jaxmpc.controller.measurement import GOOD
 from jaxmpc.errors import InputError
-from studies.definition.presets import CHOKE, LIFT
+from jaxmpc.status import OPTIMAL
+from studies.definition.presets import CHOKE, GAS, LIFT, OIL
 from studies.kpi import loop as kpi
+from studies.kpi.sweep import KPIS, Channels, Run, Tuned, rounding, run_kpis
 
 NEAR_CLOSED = 50.0  # % choke, the border in the thesis's statement on oscillation
-ROUNDING = 1e-6  # of a value at its limit, relative to the distance between the limits
 
 
 def completed(data: xr.Dataset) -> xr.Dataset:
@@ -29,32 +31,14 @@ def completed(data: xr.Dataset) -> xr.Dataset:
     return data.isel(controller=rows)
 
 
-# key figure: (its axes beside the controller, unit, what it is)
-MEANINGS: dict[str, tuple[tuple[str, ...], str, str]] = {
-    "choke_travel": ((), "%", "sum of absolute choke moves, actual position"),
-    "choke_moves": ((), "1", "choke moves"),
-    "choke_reversals": ((), "1", "choke reversals over the whole run"),
+# beyond those of `studies.kpi.sweep`: (axes beside the controller, unit, what it is)
+_OWN: dict[str, tuple[tuple[str, ...], str, str]] = {
     "late_reversals": (("window",), "1", "choke reversals in the second half of each setpoint window"),
     "late_reversals_near_closed": ((), "1", "those of them below 50 % choke, all windows"),
-    "mean_dwell": ((), "s", "mean time between successive choke moves"),
-    "shortest_dwell": ((), "s", "shortest time between successive choke moves"),
-    "lift_travel": ((), "m3/h", "sum of absolute moves of the lift"),
-    "mean_absolute_deviation": (("cv",), "cv_unit", "mean of the absolute deviation from the setpoint"),
-    "integral_absolute_error": (("cv",), "cv_unit s", "integral of the absolute deviation"),
-    "time_outside_deadzone": (("cv",), "s", "time with a deviation beyond the deadzone"),
-    "cv_violations": (("cv",), "samples", "samples with the CV outside its soft limits"),
-    "mv_violations": (("mv",), "samples", "samples with the MV outside its limits"),
     "move_violations": (("mv",), "samples", "samples with a move outside its limits"),
     "largest_mean_opening": ((), "%/sample", "largest windowed mean of the demanded choke moves"),
     "mean_move_stops": ((), "1", "pauses of the opening under the mean-move limit"),
     "openings_above_limit": ((), "1", "openings although the windowed mean was above its limit"),
-    "solve_time_median": ((), "s", "median time of one controller step"),
-    "solve_time_p99": ((), "s", "99th percentile of the time of one controller step"),
-    "solve_time_max": ((), "s", "longest controller step"),
-    "largest_gap": ((), "1", "largest relative gap"),
-    "not_optimal": ((), "samples", "samples whose solve did not end optimal"),
-    "fallbacks": ((), "samples", "samples with the MVs held for want of a plan"),
-    "bad_measurements": (("cv",), "samples", "measurements that were left out"),
     "wall_time": ((), "s", "time of the whole run"),
 }
 
@@ -63,99 +47,65 @@ def key_figures(data: xr.Dataset) -> xr.Dataset:
     """Key figures of every finished run, with units; formulas in `studies.kpi.loop`.
 
     Args:
-        data: results from `studies.store.comparison.open_results`.
+        data: results from `studies.store.reading.open_results`.
 
     Returns:
-        The variables of `MEANINGS` over ``controller`` and some over ``cv``, ``mv`` or ``window``.
+        The variables of `studies.kpi.sweep.KPIS`, in which a CV counts as settled within its own deadzone, and of `_OWN`
+        over ``controller`` and some over ``cv``, ``mv`` or ``window``.
     """
     data = completed(data).load()
     window = data.window.values
     windows = int(window.max()) + 1
     late = kpi.second_halves(window)
-    choke, lift = (list(data.mv.values).index(name) for name in (CHOKE, LIFT))
+    mvs, cvs = list(data.mv.values), list(data.cv.values)
+    channels = Channels(mvs.index(CHOKE), mvs.index(LIFT), cvs.index(GAS), cvs.index(OIL))
     rows = []
     for i in range(data.sizes["controller"]):
         run = data.isel(controller=i)
-        arrays = {name: run[name].values for name in INPUTS}
-        row = _figures(
-            arrays, late, sampling_interval(data), windows, run.mean_move_window.item(), choke, lift
-        )
+        tuned = Tuned(*(run[f"tuning_{name}"].values for name in Tuned._fields))
+        dt, span = sampling_interval(data), run.mean_move_window.item()
+        row = _figures(_arrays(run), tuned, late, dt, windows, span, channels)
         rows.append(row | {"wall_time": run.wall_time.values})
     out = {}
-    for key, (axes, unit, meaning) in MEANINGS.items():
+    for key, (axes, unit, meaning) in ({k.name: (k.dims, k.unit, k.long_name) for k in KPIS} | _OWN).items():
         values = np.stack([np.asarray(row[key]) for row in rows])
-        out[key] = xr.DataArray(
-            values, dims=("controller", *axes), attrs={"units": unit, "long_name": meaning}
-        )
+        attrs = {"units": unit, "long_name": meaning}
+        out[key] = xr.DataArray(values, dims=("controller", *axes), attrs=attrs)
     coords: dict = {name: data[name] for name in ("controller", "label", "cv", "mv", "cv_unit", "mv_unit")}
     starts = np.array([data.time.values[window == w][0] for w in range(windows)])
     coords["window"] = ("window", starts, {"long_name": "start of the setpoint window", "units": "s"})
     return xr.Dataset(out, coords)
 
 
-INPUTS = (
-    "measurement",
-    "setpoint",
-    "position",
-    "demand",
-    "move",
-    "solve_time",
-    "gap",
-    "status",
-    "fallback",
-    "quality",
-    "tuning_deadzone",
-    "tuning_cv_low",
-    "tuning_cv_high",
-    "tuning_mv_low",
-    "tuning_mv_high",
-    "tuning_move_low",
-    "tuning_move_high",
-    "tuning_mean_move_limit",
-)
+def _arrays(run: xr.Dataset) -> Run:
+    """A stored run as `run_kpis` takes it."""
+    stored = {"cv": "measurement", "mv": "position", "mv_demand": "demand"}
+    same = ("setpoint", "move", "window", "objective", "gap", "solve_time")
+    return Run(
+        **{name: run[stored.get(name, name)].values for name in (*stored, *same)},
+        optimal=run.status.values == OPTIMAL,
+        fallback=run.fallback.values != 0,
+        left_out=run.quality.values != GOOD,
+        off=run.off.values != 0,
+    )
 
 
-@functools.partial(jax.jit, static_argnames=("windows", "span", "choke", "lift"))
-def _figures(run: dict, late, dt: float, windows: int, span: int, choke: int, lift: int) -> dict:
-    """The key figures of one run as arrays; `jax.vmap` over `run` does many."""
-    position, y, r = run["position"][:, choke], run["measurement"], run["setpoint"]
-    actual = kpi.moves_of(position, run["demand"][0, choke] - run["move"][0, choke])
-    demanded = run["move"][:, choke]
+@functools.partial(jax.jit, static_argnames=("windows", "span", "channels"))
+def _figures(
+    run: Run, tuned: Tuned, late, dt: float, windows: int, span: int, channels: Channels
+) -> dict[str, Array]:
+    """The key figures of one run as arrays."""
+    position, demanded = run.mv[:, channels.choke], run.move[:, channels.choke]
+    actual = kpi.moves_of(position, run.mv_demand[0, channels.choke] - demanded[0])
     hunting = kpi.reversal_events(actual, segment=late)
-    mean_dwell, shortest_dwell = kpi.dwell(actual, dt)
-    times = kpi.solve_time_statistics(run["solve_time"])
-    limit = run["tuning_mean_move_limit"][choke]
-
-    def violations(value, kind):
-        low, high = run[f"tuning_{kind}_low"], run[f"tuning_{kind}_high"]
-        width = jnp.where(jnp.isfinite(high - low), high - low, 0.0)
-        return kpi.limit_violations(value, low, high, ROUNDING * width)
-
-    return {
-        "choke_travel": kpi.travel(actual),
-        "choke_moves": kpi.move_count(actual),
-        "choke_reversals": kpi.reversal_events(actual).sum(),
+    low, high, limit = tuned.move_low, tuned.move_high, tuned.mean_move_limit[channels.choke]
+    return run_kpis(run, tuned, tuned.deadzone, dt, channels) | {
         "late_reversals": kpi.count_by_segment(hunting, late, windows),
         "late_reversals_near_closed": (hunting & (position < NEAR_CLOSED)).sum(),
-        "mean_dwell": mean_dwell,
-        "shortest_dwell": shortest_dwell,
-        "lift_travel": kpi.travel(run["move"][:, lift]),
-        "mean_absolute_deviation": kpi.mean_absolute_deviation(y, r),
-        "integral_absolute_error": kpi.integral_absolute_error(y, r, dt),
-        "time_outside_deadzone": kpi.time_outside_deadzone(y, r, run["tuning_deadzone"], dt),
-        "cv_violations": violations(y, "cv"),
-        "mv_violations": violations(run["position"], "mv"),
-        "move_violations": violations(run["move"], "move"),
+        "move_violations": kpi.limit_violations(run.move, low, high, rounding(low, high)),
         "largest_mean_opening": kpi.windowed_mean(demanded, span).max(),
         "mean_move_stops": kpi.mean_move_stops(demanded, span, limit),
         "openings_above_limit": kpi.opening_above_limit(demanded, span, limit),
-        "solve_time_median": times[0],
-        "solve_time_p99": times[1],
-        "solve_time_max": times[2],
-        "largest_gap": kpi.largest_gap(run["gap"]),
-        "not_optimal": (run["status"] != 0).sum(),
-        "fallbacks": (run["fallback"] != 0).sum(),
-        "bad_measurements": (run["quality"] != 0).sum(axis=0),
     }
 
 

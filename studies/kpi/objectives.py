@@ -22,9 +22,8 @@ from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES
 from studies.definition import presets
 from studies.definition.sections import Search
 from studies.kpi.sweep import KPIS
-from studies.store.comparison import provenance
 from studies.store.layout import FLAG
-from studies.store.reading import open_study
+from studies.store.reading import open_study, provenance
 
 DEVIATION = "deviation"
 CHANNELS = {(): (), ("cv",): CV_NAMES, ("mv",): MV_NAMES}

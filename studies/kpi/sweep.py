@@ -19,7 +19,6 @@ from jaxtyping import Array, Float
 from jaxmpc.controller.measurement import GOOD
 from jaxmpc.errors import InputError
 from jaxmpc.loop.trajectory import TrajectoryBatch
-from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.problem.tuning import Tuning
 from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES
 from jaxmpc.status import OPTIMAL
@@ -193,6 +192,27 @@ class Run(NamedTuple):
     off: Any
 
 
+class Tuned(NamedTuple):
+    """What key figures need of a tuning, fields as in `jaxmpc.problem.tuning.Tuning`: `PER_CV` ``"cv"``, others ``"mv"``."""
+
+    cv_weight: Any
+    soft_quadratic: Any
+    soft_linear: Any
+    deadzone: Any
+    cv_low: Any
+    cv_high: Any
+    move_weight: Any
+    mv_low: Any
+    mv_high: Any
+    move_low: Any
+    move_high: Any
+    mean_move_limit: Any
+
+
+PER_CV = Tuned._fields[:6]
+WEIGHTS = "cv_weight", "soft_quadratic", "soft_linear", "deadzone", "move_weight"  # of the closed-loop cost
+
+
 class Channels(NamedTuple):
     """Positions of the well's MVs and CVs; static."""
 
@@ -260,7 +280,7 @@ def runs_of(batch: TrajectoryBatch, window) -> Run:
 
 
 def run_kpis(
-    run: Run, tuning: Tuning, tolerance: Float[Array, " cv"], dt: float, channels: Channels
+    run: Run, tuning: Tuned, tolerance: Float[Array, " cv"], dt: float, channels: Channels
 ) -> dict[str, Array]:
     """Key figures of one run.
 
@@ -283,8 +303,8 @@ def run_kpis(
     settled = kpi_setpoint.settling(y, r, change, tolerance, (start, end), dt)
     hunting = kpi.reversal_events(choke, segment=kpi_setpoint.late_segment(start, end))
     mean_dwell, shortest_dwell = kpi.dwell(choke, dt)
-    cv_limits = y, tuning.cv_low, tuning.cv_high, _rounding(tuning.cv_low, tuning.cv_high)
-    mv_limits = run.mv, tuning.mv_low, tuning.mv_high, _rounding(tuning.mv_low, tuning.mv_high)
+    cv_limits = y, tuning.cv_low, tuning.cv_high, rounding(tuning.cv_low, tuning.cv_high)
+    mv_limits = run.mv, tuning.mv_low, tuning.mv_high, rounding(tuning.mv_low, tuning.mv_high)
     times = kpi.solve_time_statistics(run.solve_time)
     finite = jnp.stack([jnp.isfinite(part).all() for part in (y, r, run.mv, run.mv_demand, run.move)]).all()
     figures = {
@@ -312,14 +332,7 @@ def run_kpis(
         "gas_produced": kpi.volume(y[:, channels.gas], dt),
         "objective": run.objective.mean(),
         "closed_loop_cost": kpi.closed_loop_cost(
-            y,
-            r,
-            moves,
-            cv_weight=tuning.cv_weight,
-            soft_quadratic=tuning.soft_quadratic,
-            soft_linear=tuning.soft_linear,
-            deadzone=tuning.deadzone,
-            move_weight=tuning.move_weight,
+            y, r, moves, **{name: getattr(tuning, name) for name in WEIGHTS}
         ),
         "solve_time_median": times[0],
         "solve_time_p99": times[1],
@@ -338,7 +351,7 @@ def run_kpis(
     }
 
 
-def _rounding(low, high):
+def rounding(low, high):
     """How far beyond a limit is still at the limit."""
     width = high - low
     return ROUNDING * jnp.where(jnp.isfinite(width), width, 0.0)
@@ -365,12 +378,11 @@ def batch_kpis(batch: TrajectoryBatch, tunings: Tuning, window, *, tolerance=Non
     channels = channels_of(batch)
     runs = runs_of(batch, window)
     lanes, cvs, mvs = len(batch), len(batch.cv_names), len(batch.mv_names)
-    sizes = {"cv": (cvs,), "mv": (mvs,), "": ()}
-    each = Tuning(
-        **{
-            key: _per_lane(f"tunings.{key}", getattr(tunings, key), lanes, sizes[field.of])
-            for key, field in TUNING.items()
-        }
+    each = Tuned(
+        *(
+            _per_lane(f"tunings.{name}", getattr(tunings, name), lanes, (cvs if name in PER_CV else mvs,))
+            for name in Tuned._fields
+        )
     )
     allowed = each.deadzone
     if tolerance is not None:
@@ -394,7 +406,7 @@ def _per_lane(field: str, given, lanes: int, size: tuple[int, ...]) -> Any:
 
 
 @functools.partial(jax.jit, static_argnames="channels")
-def _batched(runs: Run, tunings: Tuning, tolerance, dt, channels: Channels) -> dict[str, Array]:
+def _batched(runs: Run, tunings: Tuned, tolerance, dt, channels: Channels) -> dict[str, Array]:
     """`run_kpis` of every lane."""
     return jax.vmap(lambda run, tuning, near: run_kpis(run, tuning, near, dt, channels))(
         runs, tunings, tolerance

@@ -333,7 +333,7 @@ def _(InputError, again, compilation_shown, draw, mo, page, path, picked):
                 from pathlib import Path
 
                 from figures.closed_loop import of_trajectory
-                from studies.run.rerun import rerun
+                from studies.rerun import rerun
 
                 with compilation_shown(), mo.status.spinner("running"):
                     found = rerun(Path(store), number)

@@ -188,7 +188,7 @@ class ExploreRun:
 
     @functools.cached_property
     def data(self) -> xr.Dataset:
-        """The run as `studies.store.comparison.open_results` would give it, with one controller `RUN`."""
+        """The run as `studies.store.reading.open_results` would give it, with one controller `RUN`."""
         t, structure, settings = self.trajectory, self.structure, self.settings
         kind, actuator = CONTROLLERS[settings.controller]
         window = settings.reference.window(t.dt, t.samples)

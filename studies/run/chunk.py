@@ -21,9 +21,10 @@ import numpy as np
 
 from jaxmpc.controller.batch import Lanes, controller_batch
 from jaxmpc.controller.mixed_integer import MixedIntegerControllers
+from jaxmpc.files import strict_json
 from jaxmpc.integer.relaxer import forget_programs
 from jaxmpc.loop.simulate import simulate_batches
-from jaxmpc.loop.trajectory import AXES, TrajectoryBatch
+from jaxmpc.loop.trajectory import TrajectoryBatch
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.tuning import stack_tunings
 from jaxmpc.process.plant import WellPlant
@@ -32,9 +33,9 @@ from studies.definition import presets
 from studies.definition.models import Point, identify_models
 from studies.definition.scenarios import Scenario, Study
 from studies.kpi.sweep import KPIS, RECORD, batch_kpis
-from studies.store.comparison import VARIABLES
 from studies.store.fingerprint import versions
 from studies.store.layout import FLAG, StoreLayout, Variable
+from studies.store.trajectories import swept
 
 # A CV counts as settled within the deadzone of the thesis, whatever its own: otherwise a wide deadzone settles at once.
 SETTLED = tuple(presets.tuning_fields("thesis")["deadzone"][name] for name in CV_NAMES)
@@ -171,7 +172,7 @@ def run_scenarios(
     fields = {name: values[: len(scenarios)] for name, values in figures.items()}
     fields[FLAG] = fields["finite"].astype("i1")
     for field in trajectories:
-        fields[stored_name(field)] = _kept(batch, field, len(scenarios), every, points)
+        fields[swept(field).name] = _kept(batch, field, len(scenarios), every, points)
     facts = {
         "wall_time": time.perf_counter() - begin,
         "simulation_time": simulated - begin,
@@ -198,24 +199,11 @@ def _plants(scenarios: Sequence[Scenario], fields: Sequence[str]) -> Lanes[WellP
 
 def _kept(batch: TrajectoryBatch, field: str, lanes: int, every: int, points: int) -> np.ndarray:
     """A trajectory at the stored times, filled up to their number."""
-    kind, empty = VARIABLES[field_key(field)][2:4] if field != "setpoint" else ("f8", np.nan)
-    values = batch.setpoint if field == "setpoint" else batch[field]
-    values = np.asarray(values)[:lanes, ::every]
-    out = np.full((lanes, points, *values.shape[2:]), empty, dtype=kind)
+    variable = swept(field)
+    values = np.asarray(batch.setpoint if field == "setpoint" else batch[field])[:lanes, ::every]
+    out = np.full((lanes, points, *values.shape[2:]), variable.empty, dtype=variable.dtype)
     out[:, : values.shape[1]] = values
     return out
-
-
-def field_key(field: str) -> str:
-    """The entry of `studies.store.comparison.VARIABLES` that holds a field of `Trajectory`."""
-    return next(name for name, (source, *_) in VARIABLES.items() if source == field)
-
-
-def stored_name(field: str) -> str:
-    """Name of the stored trajectory of a field of `Trajectory`; a key figure has the name ``objective`` already."""
-    if field == "setpoint":
-        return field
-    return {"objective": "plan_objective"}.get(field_key(field), field_key(field))
 
 
 def stored_times(study: Study) -> np.ndarray:
@@ -262,34 +250,8 @@ def study_layout(study: Study, command: str | None = None) -> StoreLayout:
     )
 
 
-def strict_json(value: Any) -> Any:
-    """A definition with its infinite numbers, for which JSON has no word, as ``{"number": "inf"}``."""
-    if isinstance(value, Mapping):
-        return {str(key): strict_json(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [strict_json(entry) for entry in value]
-    return {"number": str(value)} if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def from_strict_json(value: Any) -> Any:
-    """The definition that `strict_json` was given."""
-    if isinstance(value, dict):
-        plain = {key: from_strict_json(entry) for key, entry in value.items()}
-        return float(plain["number"]) if list(plain) == ["number"] else plain
-    return [from_strict_json(entry) for entry in value] if isinstance(value, list) else value
-
-
 def stored_variables(trajectories: Sequence[str]) -> tuple[Variable, ...]:
     """Key figures, the flag of a complete run, and trajectories."""
     figures = [Variable(k.name, k.long_name, k.unit, k.dims) for k in KPIS]
     flag = Variable(FLAG, "1 where every CV and MV of the run is finite", "1", (), "i1", 0)
-    over_time = []
-    for field in trajectories:
-        axis = next(axis for axis, names in AXES.items() if field in names)
-        dims = ("time", axis) if axis else ("time",)
-        if field == "setpoint":
-            over_time.append(Variable("setpoint", "setpoint", "cv_unit", dims))
-            continue
-        _, _, kind, empty, long_name, unit = VARIABLES[field_key(field)]
-        over_time.append(Variable(stored_name(field), long_name, unit, dims, kind, empty))
-    return (*figures, flag, *over_time)
+    return (*figures, flag, *(swept(field) for field in trajectories))

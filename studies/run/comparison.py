@@ -1,7 +1,7 @@
 """Runs several controllers over one reference on one plant and stores each run as soon as it is done.
 
-`run_comparison` is given everything that numbers depend on and asks the store which runs are missing, so a
-second call computes only what changed.
+A comparison is a list of scenarios with names, each a chunk of its store. `run_comparison` is given everything that
+numbers depend on and asks the store which runs are missing, so a second call computes only what changed.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import dataclasses
 import datetime
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,34 +27,19 @@ from jaxmpc.errors import InputError
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.problem.tuning import Tuning
 from jaxmpc.programs.compilation import compiled_since
 from studies.definition.comparison import ComparisonDefinition, ControllerDefinition
-from studies.store.comparison import (
-    FORMAT,
-    RESULTS,
-    ResultStore,
-    open_results,
-    provenance,
-    results_template,
-    undamaged,
-)
+from studies.store.files import FORMAT, RESULTS, open_manifest, survey
 from studies.store.fingerprint import content_hash, source_hash, versions
+from studies.store.layout import Column, StoreLayout
+from studies.store.reading import open_results, provenance
+from studies.store.trajectories import PLAN, RUN_VARIABLES, run_fields
+from studies.store.writing import Store
 
 Say = Callable[[str], None]
-TUNING_AXES = {
-    "cv": ("cv_weight", "soft_quadratic", "soft_linear", "deadzone", "cv_low", "cv_high", "slack_weight"),
-    "mv": (
-        "move_weight",
-        "mv_low",
-        "mv_high",
-        "move_low",
-        "move_high",
-        "mean_move_limit",
-        "oscillation_rows",
-    ),
-    "": ("bias_cutoff",),
-}
 
 
 def run_comparison(
@@ -105,24 +90,47 @@ def run_comparison(
         for controller in definition.controllers
     ]
     study_hash = content_hash(FORMAT, msgspec.to_builtins(definition), hashes)
-    store = ResultStore.begin(
-        folder,
-        [controller.name for controller in definition.controllers],
-        study_hash,
-        lambda: comparison_template(definition, model, extra(), hashes, study_hash, plant_facts, code),
-        say,
-        others,
-    )
-    for controller in definition.controllers:
-        if store.complete(controller.name):
-            say(f"{controller.label}: stored already.")
-            continue
-        started = time.perf_counter()
+    layout = comparison_layout(definition, model, extra, hashes, study_hash, plant_facts, code)
+
+    def run(i: int) -> Trajectory:
+        controller = definition.controllers[i]
         given = {"schedule": schedule} if controller.schedule else {}
-        trajectory = run_controller(controller, definition, model, make_plant, progress, **given)
-        wall_time = time.perf_counter() - started
-        store.write(controller.name, trajectory, wall_time)
-        say(f"{controller.label}: {trajectory.samples} samples in {wall_time:.1f} s.")
+        return run_controller(controller, definition, model, make_plant, progress, **given)
+
+    return run_missing(folder, layout, run, say, others)
+
+
+def run_missing(
+    folder: Path,
+    layout: StoreLayout,
+    run: Callable[[int], Trajectory],
+    say: Say,
+    others: Sequence[Path] = (),
+) -> Path:
+    """Run the controllers that a store does not hold yet, in order, and store each at once.
+
+    Args:
+        folder: of the study; its store is locked by the caller.
+        layout: from `results_layout`.
+        run: closes the loop of a controller, by its number.
+        say: receives a line per controller and event.
+        others: stores of other studies, for a new store to take equal runs from.
+
+    Returns:
+        The folder.
+    """
+    with Store.begin(folder / RESULTS, layout, say, others=others, lock=False) as store:
+        missing = store.pending()
+        for i, label in enumerate(layout.columns[0].values):
+            if i not in missing:
+                say(f"{label}: stored already.")
+                continue
+            started = time.perf_counter()
+            trajectory = run(i)
+            wall_time = time.perf_counter() - started
+            fields = run_fields(trajectory, wall_time, layout.lengths[PLAN.dims[1]])
+            store.commit(i, fields, {"wall_time": wall_time})
+            say(f"{label}: {trajectory.samples} samples in {wall_time:.1f} s.")
     return folder
 
 
@@ -133,9 +141,10 @@ def is_current(definition: ComparisonDefinition, folder: Path) -> bool:
         definition: of the study.
         folder: its results.
     """
-    if not undamaged(folder / RESULTS, range(len(definition.controllers))):
-        return False
     try:
+        store, manifest = open_manifest(folder / RESULTS)
+        if len(survey(store, manifest["contents"], deep=True).records) < len(definition.controllers):
+            return False
         with open_results(folder) as data:
             # a stored definition is JSON: tuples are lists
             wanted = msgspec.json.decode(msgspec.json.encode(definition))
@@ -226,21 +235,78 @@ def closing(plant: Any) -> Iterator[Any]:
             close()
 
 
-def comparison_template(
+def results_layout(
+    *,
+    controllers: Mapping[str, str],
+    hashes: Sequence[str],
+    structure: Structure,
+    samples: int,
+    blocks: int,
+    shared: Callable[[], Mapping[str, xr.DataArray]],
+    provenance: dict[str, Any],
+    study_hash: str,
+) -> StoreLayout:
+    """The store of a comparison.
+
+    Args:
+        controllers: name and label of each.
+        hashes: content hash of each controller's inputs.
+        structure: names, units and dt of all of them.
+        samples: of the runs.
+        blocks: of the controller that has most.
+        shared: gives the variables without a trajectory: setpoints, tuning, model, sweep.
+        provenance: JSON-like facts, one attribute each, with ``study`` and ``title``.
+        study_hash: hash of everything that the results depend on.
+    """
+    s, facts = (
+        structure,
+        provenance
+        | {
+            "versions": versions(),
+            "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        },
+    )
+    return StoreLayout(
+        name=facts["study"],
+        title=facts["title"],
+        study_hash=study_hash,
+        chunk_size=1,
+        chunk_scenarios=tuple(np.arange(i, i + 1) for i in range(len(hashes))),
+        scenario_hashes=tuple(hashes),
+        columns=(
+            Column("label", "controller and actuator", "", np.array(list(controllers.values()), object)),
+        ),
+        variables=RUN_VARIABLES,
+        coords={
+            "time": (s.dt * np.arange(samples), "s", "time"),
+            "cv": (s.cv_names, "", "controlled variable"),
+            "mv": (s.mv_names, "", "manipulated variable"),
+            "cv_unit": (s.cv_units, "", "unit of the CV"),
+            "mv_unit": (s.mv_units, "", "unit of the MV"),
+        },
+        provenance={"dt": s.dt, **facts},
+        rows="controller",
+        names=tuple(controllers),
+        lengths={PLAN.dims[1]: blocks},
+        shared=shared,
+    )
+
+
+def comparison_layout(
     definition: ComparisonDefinition,
     model: StepResponseModel,
-    extra: dict[str, xr.DataArray],
-    hashes: list[str],
+    extra: Callable[[], dict[str, xr.DataArray]],
+    hashes: Sequence[str],
     study_hash: str,
     plant_facts: dict[str, Any],
     code: dict[str, str],
-) -> xr.Dataset:
-    """The results of a comparison before anything has run: setpoints, tuning, model and provenance.
+) -> StoreLayout:
+    """The store of a comparison: setpoints, tuning, model and provenance.
 
     Args:
         definition: of the study.
         model: prediction model.
-        extra: further variables.
+        extra: gives further variables.
         hashes: content hash of every controller's inputs.
         study_hash: of everything.
         plant_facts: identifies the plant.
@@ -256,64 +322,48 @@ def comparison_template(
         )
     if abs(model.dt - first.dt) > 1e-9:
         raise InputError("model.dt", model.dt, f"the sampling interval of the controllers, {first.dt} s")
-    window = reference.window(first.dt)
-    shared = {
-        "setpoint": xr.DataArray(
-            reference.sample(first.dt),
-            dims=("time", "cv"),
-            attrs={"long_name": "setpoint", "units": "cv_unit"},
-        ),
-        "window": xr.DataArray(
-            window.astype("i4"),
-            dims="time",
-            attrs={"long_name": "index of the setpoint window", "units": "1"},
-        ),
-        "disturbance": xr.DataArray(
-            definition.offsets(first.dt),
-            dims="time",
-            attrs={"long_name": "offset of the reservoir pressure", "units": "bar"},
-        ),
-        "model_coefficient": xr.DataArray(
-            np.asarray(model.coefficients),
-            dims=("cv", "mv", "lag"),
-            coords={
-                "lag": (
-                    "lag",
-                    first.dt * np.arange(1, model.samples + 1),
-                    {"long_name": "time after the step", "units": "s"},
-                )
-            },
-            attrs={"long_name": "step-response coefficient", "units": "cv_unit per mv_unit"},
-        ),
-        **_controller_variables(definition),
-        **extra,
-    }
-    provenance = {
-        "study": definition.name,
-        "title": definition.title,
-        "dt": first.dt,
-        "definition": msgspec.to_builtins(definition),
-        "structures": [dataclasses.asdict(controller.structure()) for controller in definition.controllers],
-        "plant": plant_facts,
-        "model": {"working_point": dict(model.working_point), "provenance": dict(model.provenance)},
-        "code": code,
-        "versions": versions(),
-        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-    }
-    return results_template(
-        controllers=[controller.name for controller in definition.controllers],
-        labels=[controller.label for controller in definition.controllers],
+    structures = [controller.structure() for controller in definition.controllers]
+    return results_layout(
+        controllers={controller.name: controller.label for controller in definition.controllers},
         hashes=hashes,
-        time=first.dt * np.arange(len(window)),
-        cv_names=first.cv_names,
-        mv_names=first.mv_names,
-        cv_units=first.cv_units,
-        mv_units=first.mv_units,
-        blocks=max(controller.structure().block_count for controller in definition.controllers),
-        shared=shared,
-        provenance=provenance,
+        structure=first,
+        samples=reference.samples(first.dt),
+        blocks=max(structure.block_count for structure in structures),
+        shared=lambda: _shared(definition, model) | extra(),
+        provenance={
+            "study": definition.name,
+            "title": definition.title,
+            "definition": msgspec.to_builtins(definition),
+            "structures": [dataclasses.asdict(structure) for structure in structures],
+            "plant": plant_facts,
+            "model": {"working_point": dict(model.working_point), "provenance": dict(model.provenance)},
+            "code": code,
+        },
         study_hash=study_hash,
     )
+
+
+def labelled(values: Any, dims: Sequence[str], long_name: str, unit: str, **axes: Any) -> xr.DataArray:
+    """A variable of the results; `axes` are the values, long name and unit of axes of its own."""
+    coords = {name: (name, at, {"long_name": what, "units": of}) for name, (at, what, of) in axes.items()}
+    return xr.DataArray(values, coords, dims, attrs={"long_name": long_name, "units": unit})
+
+
+def _shared(definition: ComparisonDefinition, model: StepResponseModel) -> dict[str, xr.DataArray]:
+    """Setpoints, disturbance, model and the controllers' tuning."""
+    reference, dt = definition.reference.build(), model.dt
+    window = reference.window(dt).astype("i4")
+    lag = dt * np.arange(1, model.samples + 1), "time after the step", "s"
+    coefficients = np.asarray(model.coefficients)
+    return {
+        "setpoint": labelled(reference.sample(dt), ("time", "cv"), "setpoint", "cv_unit"),
+        "window": labelled(window, ("time",), "index of the setpoint window", "1"),
+        "disturbance": labelled(definition.offsets(dt), ("time",), "offset of the reservoir pressure", "bar"),
+        "model_coefficient": labelled(
+            coefficients, ("cv", "mv", "lag"), "step-response coefficient", "cv_unit per mv_unit", lag=lag
+        ),
+        **_controller_variables(definition),
+    }
 
 
 def _controller_variables(definition: ComparisonDefinition) -> dict[str, xr.DataArray]:
@@ -321,34 +371,23 @@ def _controller_variables(definition: ComparisonDefinition) -> dict[str, xr.Data
     tunings = [controller.build_tuning() for controller in definition.controllers]
     structures = [controller.structure() for controller in definition.controllers]
     out = {}
-    for axis, keys in TUNING_AXES.items():
-        for key in keys:
-            values = np.stack([np.asarray(getattr(tuning, key), dtype=float) for tuning in tunings])
-            out[f"tuning_{key}"] = xr.DataArray(
-                values,
-                dims=("controller", axis) if axis else ("controller",),
-                attrs={"long_name": f"tuning: {key.replace('_', ' ')}"},
-            )
+    for key, field in TUNING.items():
+        values = np.stack([np.asarray(getattr(tuning, key), dtype=float) for tuning in tunings])
+        attrs = {"long_name": f"tuning: {key.replace('_', ' ')}"}
+        dims = ("controller", field.of) if field.of else ("controller",)
+        out[f"tuning_{key}"] = xr.DataArray(values, dims=dims, attrs=attrs)
     most = max(structure.block_count for structure in structures)
-    out["block_length"] = xr.DataArray(
-        np.array([[*s.blocks, *[0] * (most - s.block_count)] for s in structures], dtype="i4"),
-        dims=("controller", "block"),
-        attrs={"long_name": "samples of a block, 0 beyond the last", "units": "1"},
-    )
-    for key in ("prediction_horizon", "control_horizon"):
-        out[key] = xr.DataArray(
-            np.array([getattr(structure, key) for structure in structures], dtype="i4"),
-            dims="controller",
-            attrs={"long_name": key.replace("_", " "), "units": "1"},
-        )
-    text = np.dtypes.StringDType()
+    lengths = np.array([[*s.blocks, *[0] * (most - s.block_count)] for s in structures], dtype="i4")
+    what = "samples of a block, 0 beyond the last"
+    out["block_length"] = labelled(lengths, ("controller", "block"), what, "1")
+    for key, what in {
+        "prediction_horizon": "prediction horizon",
+        "control_horizon": "control horizon",
+        "mean_move_window": "samples of the mean move",
+    }.items():
+        values = np.array([getattr(structure, key) for structure in structures], dtype="i4")
+        out[key] = labelled(values, ("controller",), what, "1")
     for key in ("kind", "actuator", "blocking", "tuning"):
-        values = [getattr(controller, key) for controller in definition.controllers]
-        name = "tuning_preset" if key == "tuning" else key
-        out[name] = xr.DataArray(np.array(values, dtype=text), dims="controller")
-    out["mean_move_window"] = xr.DataArray(
-        np.array([structure.mean_move_window for structure in structures], dtype="i4"),
-        dims="controller",
-        attrs={"long_name": "samples of the mean move", "units": "1"},
-    )
+        values = np.array([getattr(controller, key) for controller in definition.controllers], dtype=object)
+        out["tuning_preset" if key == "tuning" else key] = xr.DataArray(values, dims="controller")
     return out

@@ -11,7 +11,7 @@ from typing import Any
 from tqdm import tqdm
 
 from jaxmpc.programs.compilation import clock
-from studies.run.estimate import Pace, Work, readable
+from studies.definition.estimate import Pace, Work, readable
 
 LAYOUT = "{l_bar}{bar}| {n_fmt}/{total_fmt} scenarios [{elapsed}{postfix}]"
 

@@ -21,7 +21,7 @@ from studies.run.chunk import ChunkResult, PreparedStudy, prepare_study, study_l
 from studies.run.executors import Cluster, Executor, Here, LostError, Processes, connect, disconnect
 from studies.run.progress import progress_bar
 from studies.store.reading import chunk_facts
-from studies.store.sweep import SweepStore
+from studies.store.writing import Store
 
 TRIES = 3  # of a chunk whose worker dies
 LOOK = 5.0  # s between two looks whether those who compute are still there
@@ -46,7 +46,7 @@ def run_study(
     """Compute what is missing of a study and store every chunk as soon as it is done.
 
     Args:
-        study: from `scenarios.load_study`.
+        study: from `studies.load`.
         store: path that ends in ``.zarr``, or a folder that is to hold ``study.zarr``.
         workers: processes on this machine; 1 computes in this process. With more, a script of your own has to keep
             what it does below ``if __name__ == "__main__":``, as always with spawned processes.
@@ -74,7 +74,7 @@ def run_study(
         if dask is not None:
             client = connect(dask)
             stack.callback(disconnect, client)
-        writer = stack.enter_context(SweepStore.begin(store, study_layout(study, command), say))
+        writer = stack.enter_context(Store.begin(store, study_layout(study, command), say))
         missing = writer.pending()
         if len(missing) < len(study.chunks):
             say(_stored(study, writer))
@@ -102,7 +102,7 @@ def run_study(
         return writer.path
 
 
-def _stored(study: Study, writer: SweepStore) -> str:
+def _stored(study: Study, writer: Store) -> str:
     count = len(study.chunks) - len(writer.pending())
     return f"{count} of {len(study.chunks)} chunks are stored."
 

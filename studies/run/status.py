@@ -1,4 +1,4 @@
-"""How far a sweep study is: what its store holds, what is damaged, how fast it went, and what to do next."""
+"""How far a study is: what its store holds, what is damaged, how fast it went, and what to do next."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import numpy as np
 import zarr
 
 from jaxmpc.errors import InputError
-from studies.run.estimate import Work, megabytes, readable
+from studies.definition.estimate import Work, megabytes, readable
+from studies.store.files import Survey, open_manifest, survey
 from studies.store.layout import FLAG
 from studies.store.reading import read_small
-from studies.store.records import Survey, open_manifest, survey
-from studies.store.sweep import held
+from studies.store.writing import held
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,8 @@ class StudyStatus:
         seconds_left: what one worker needs for the rest [s], every group by its own stored chunks (`estimate.Work`);
             NaN where the store does not say what the chunks are.
         running: whether a run writes the store right now.
-        definition: what follows ``jaxmpc study run``, quoted for a shell, as far as the provenance says.
+        definition: what follows ``jaxmpc study run``, quoted for a shell, as far as the provenance says; empty for a
+            comparison, whose store is not given.
     """
 
     store: Path
@@ -80,15 +81,17 @@ class StudyStatus:
         if self.pace:
             lines.append(self.pace)
         lines += [f"Damaged: {name}" for name in self.damaged]
-        again = f"jaxmpc study run {self.definition} --store {shlex.quote(str(self.store))}"
+        again = ", give the command of the study again."
+        if self.definition:
+            again = f":\n  jaxmpc study run {self.definition} --store {shlex.quote(str(self.store))}"
         if self.running:
             lines.append("A run is writing it now.")
         elif self.damaged:
-            lines.append(f"To compute what is damaged or missing again:\n  {again}")
+            lines.append(f"To compute what is damaged or missing again{again}")
         elif self.chunks_done < self.chunks_total:
-            lines.append(f"To continue:\n  {again}")
+            lines.append(f"To continue{again}")
         else:
-            lines.append("Complete. To compute what a changed definition adds, and nothing else:\n  " + again)
+            lines.append(f"Complete. To compute what a changed definition adds, and nothing else{again}")
         return "\n".join(lines)
 
 
@@ -123,12 +126,14 @@ def status(path: str | Path, verify: bool = False) -> StudyStatus:
         scenarios_done=sum(counts[i] for i in found.records),
         scenarios_total=sum(counts),
         failed=failed,
-        bytes=sum(length for group in files for length, _ in group.values()),
+        bytes=sum(sum(sizes.values()) for sizes in files),
         damaged=tuple(found.damage),
         rate=computed / work if work > 0 else float("nan"),
         seconds_left=_seconds_left(root.attrs, found),
         running=held(store),
-        definition=str(root.attrs.get("definition_file", "STUDY.toml")),
+        definition=str(
+            root.attrs.get("definition_file", "STUDY.toml" if manifest["rows"] == "scenario" else "")
+        ),
     )
 
 

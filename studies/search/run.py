@@ -31,7 +31,7 @@ from studies.search.space import Parameter, Point
 from studies.search.study import SearchStudy
 from studies.store.layout import FLAG
 from studies.store.reading import chunk_facts, open_study
-from studies.store.sweep import SweepStore
+from studies.store.writing import Store
 
 __all__ = ["SearchStudy", "front", "run_search"]
 
@@ -55,7 +55,7 @@ def run_search(
     influence on what is asked next and is never on the front.
 
     Args:
-        study: from `scenarios.load_study`, of a definition with ``[search]``.
+        study: from `studies.load`, of a definition with ``[search]``.
         store: path that ends in ``.zarr``, or a folder that is to hold ``study.zarr``.
         workers: only 1, as every batch waits for the one before it; a larger ``study.chunk_size`` uses more cores.
         dask: only None, for the same reason.
@@ -77,7 +77,7 @@ def run_search(
     if dask is not None:
         raise InputError("dask", dask, "nothing: a search runs in this process", hint)
     sampler = _Sampler(study)
-    with SweepStore.begin(store, study.layout(command), say) as writer:
+    with Store.begin(store, study.layout(command), say) as writer:
         missing = set(writer.pending())
         done = study.batches - len(missing)
         if done:
@@ -92,12 +92,12 @@ def run_search(
         return writer.path
 
 
-def _stored_batches(study: SearchStudy, writer: SweepStore) -> str:
+def _stored_batches(study: SearchStudy, writer: Store) -> str:
     return f"{study.batches - len(writer.pending())} of {study.batches} batches are stored."
 
 
 def _search(
-    study: SearchStudy, sampler: _Sampler, writer: SweepStore, missing: set[int], bar: Progress, say: Say
+    study: SearchStudy, sampler: _Sampler, writer: Store, missing: set[int], bar: Progress, say: Say
 ) -> None:
     stored = _Stored(study, writer.path) if len(missing) < study.batches else None
     runner, told = _Runner(study), []

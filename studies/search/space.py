@@ -15,7 +15,7 @@ from msgspec import UNSET
 from jaxmpc.errors import InputError
 from studies.definition.axes import expand_axes
 from studies.definition.fields import Field
-from studies.definition.scenarios import Study, expand
+from studies.definition.scenarios import Study, expand_sweep
 from studies.definition.sections import Distribution, Sampling
 from studies.definition.sweep import StudyDefinition
 
@@ -114,7 +114,7 @@ def listed(definition: StudyDefinition, parameters: Sequence[Parameter], points:
         axes.append(msgspec.structs.replace(axis, values=values, **sources))
     plain = dataclasses.replace(definition, axes=tuple(axes), sampling=Sampling(method="zip"), search=None)
     try:
-        return expand(plain, confirmed=True)
+        return expand_sweep(plain, confirmed=True)
     except InputError as error:
         where = re.sub(r"\.values\[\d+\](\[\d+\])?", "", error.field)
         raise InputError(where, error.value, error.expected, error.hint) from None

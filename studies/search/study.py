@@ -19,13 +19,13 @@ from msgspec import UnsetType
 
 from jaxmpc.errors import InputError
 from studies.definition.axes import check_count
+from studies.definition.estimate import MODEL_SECONDS, Work, chunk_seconds
 from studies.definition.fields import Field
 from studies.definition.scenarios import Description, Study
 from studies.definition.sections import Search
 from studies.definition.sweep import StudyDefinition
 from studies.kpi.objectives import Objective, objectives_of
 from studies.run.chunk import study_layout
-from studies.run.estimate import MODEL_SECONDS, Work, chunk_seconds
 from studies.search.space import (
     Parameter,
     Point,
@@ -43,16 +43,6 @@ LIBRARY = "optuna"
 BATCH = 64  # scenarios, where the definition does not say
 
 
-class SearchDescription(Description):
-    """What a search would do."""
-
-    def __str__(self) -> str:
-        lines = super().__str__().splitlines()
-        size = self.group_sizes[0] // self.chunks
-        lines[2] = f"search      {self.chunks} batches of {size} scenarios, each asked after the one before"
-        return "\n".join(lines)
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class EvaluatedStudy(Study):
     """The stored scenarios of a search as an ordinary study; the hashes are those of the search."""
@@ -66,7 +56,7 @@ class EvaluatedStudy(Study):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SearchStudy:
-    """A search, checked when it exists; made by `StudyDefinition.expand` and `scenarios.load_study`.
+    """A search, checked when it exists; made by `studies.load`.
 
     Scenario k belongs to batch ``k // chunk_size``.
 
@@ -171,11 +161,11 @@ class SearchStudy:
         seconds = chunk_seconds(group.kind, group.samples, self.chunk_size)
         return Work([0] * self.batches, [group.kind], [seconds])
 
-    def describe(self) -> SearchDescription:
+    def describe(self) -> Description:
         """What a run would do, for a dry run; prints as a short table."""
         group, each = self.probe.groups[0], self.probe.describe()
         models, samples = len(self.probe.model_points), self.count * group.samples
-        return SearchDescription(
+        return Description(
             name=self.name,
             scenarios=self.count,
             group_sizes=(self.count,),
@@ -185,6 +175,7 @@ class SearchStudy:
             samples=samples,
             stored_bytes=each.stored_bytes // each.scenarios * self.count,
             seconds=MODEL_SECONDS * models + self.work.rest({}),
+            searched=True,
         )
 
     def layout(self, command: str | None = None) -> StoreLayout:

@@ -10,8 +10,8 @@ import xarray as xr
 
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.files import check_target, write_atomically
+from studies.store.files import store_path
 from studies.store.reading import kpi_frame, open_study
-from studies.store.records import store_path
 
 FORMATS = {".csv": "csv", ".parquet": "parquet", ".nc": "netcdf"}
 _INT32 = np.iinfo(np.int32)
@@ -75,27 +75,20 @@ def export(path: str | Path, target: str | Path, format: str | None = None, over
     return write_atomically(target, content)
 
 
+# where a type has no counterpart in netCDF 3, by kind and bytes
+_TYPES = {"b1": "i1", "i2": "i4", "i8": "i4", "u1": "i2", "u2": "i4", "u4": "i4", "u8": "i4", "f2": "f4"}
+
+
 def _netcdf_ready(data: xr.Dataset) -> xr.Dataset:
     """Everything in memory, in types that netCDF 3 has."""
     data = data.load().copy()
     for name, variable in data.variables.items():
-        kind, values = variable.dtype.kind, variable.values
-        if kind == "b":
-            small = values.astype("i1")
-        elif kind in "iu" and variable.dtype.itemsize > 1:
-            if values.size and (values.min() < _INT32.min or values.max() > _INT32.max):
-                raise InputError(
-                    str(name), "integers beyond 32 bits", "integers that netCDF 3 holds", "Use CSV"
-                )
-            small = values.astype("i4")
-        elif kind == "u":
-            small = values.astype("i2")
-        elif kind == "f" and variable.dtype.itemsize == 2:
-            small = values.astype("f4")
-        elif kind == "O":
-            small = values.astype(str)
-        else:
+        kind, values = f"{variable.dtype.kind}{variable.dtype.itemsize}", variable.values
+        stored = str if kind[0] == "O" else _TYPES.get(kind)
+        if stored is None:
             continue
-        replaced = xr.Variable(variable.dims, small, variable.attrs)
-        data = data.assign_coords({name: replaced}) if name in data.coords else data.assign({name: replaced})
+        if stored == "i4" and values.size and (values.min() < _INT32.min or values.max() > _INT32.max):
+            raise InputError(str(name), "integers beyond 32 bits", "integers that netCDF 3 holds", "Use CSV")
+        replaced = {name: xr.Variable(variable.dims, values.astype(stored), variable.attrs)}
+        data = data.assign_coords(replaced) if name in data.coords else data.assign(replaced)
     return data

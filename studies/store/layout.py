@@ -1,22 +1,24 @@
-"""What the store of a sweep study has to know of the study: its columns, variables, axes and scenario hashes.
+"""What a store has to know of its study: scenarios with their hashes, columns, variables and axes.
 
 The scenarios of chunk ``i`` lie on the slots ``i * chunk_size`` to ``(i + 1) * chunk_size - 1`` of the store, so
-one chunk of the study is one Zarr chunk of every variable; slots beyond the scenarios of a chunk are padding.
+one chunk of the study is one Zarr chunk of every variable; slots beyond the scenarios of a chunk are padding. A
+comparison is a list of scenarios with names, its controllers, in chunks of one.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from jaxmpc.errors import InputError
+from studies.store.fingerprint import content_hash
 
-RESERVED = ("scenario", "slot", "scenario_hash", "commits")  # names that the store itself uses
+RESERVED = ("scenario", "slot", "scenario_hash", "commits", "manifest")  # names that the store itself uses
 FLAG = "complete"  # the one variable that the store also knows
 
 
@@ -73,6 +75,10 @@ class StoreLayout:
         variables: the results. One may be called ``complete``: 1 where the scenario ran to its end.
         coords: values, unit and long name of each axis; ``<axis>_unit`` holds the units along an axis.
         provenance: JSON-like facts, one attribute each.
+        rows: what a scenario is called; another name than ``scenario`` needs `names` and chunks of one.
+        names: of the scenarios, where they have names instead of numbers.
+        lengths: of axes without values; results of other lengths are taken over, cut or filled up.
+        shared: gives what belongs to no chunk, with the axes of its own; asked for when a store is made.
     """
 
     name: str
@@ -85,12 +91,21 @@ class StoreLayout:
     variables: tuple[Variable, ...]
     coords: dict[str, tuple[Any, str, str]]
     provenance: dict[str, Any]
+    rows: str = "scenario"
+    names: tuple[str, ...] = ()
+    lengths: Mapping[str, int] = field(default_factory=dict)
+    shared: Callable[[], Mapping[str, xr.DataArray]] = dict
+
+    @property
+    def slot_axis(self) -> str:
+        """Name of the first axis of every variable in the store."""
+        return self.rows if self.names else "slot"
 
     @cached_property
     def schema(self) -> str:
         """Hash of what the stored numbers mean: names, units, axes with their values, types."""
-        axes = {axis for variable in self.variables for axis in variable.dims}
-        return digest(
+        axes = {axis for variable in self.variables for axis in variable.dims} - set(self.lengths)
+        return content_hash(
             sorted(
                 [v.name, v.unit, list(v.dims), np.dtype(v.dtype).str, repr(v.empty)] for v in self.variables
             ),
@@ -109,13 +124,16 @@ class StoreLayout:
     @cached_property
     def identity(self) -> str:
         """Hash of the study and of how it is cut into chunks: a store with another one is another store."""
-        return digest(
+        return content_hash(
             self.study_hash, self.chunk_size, [list(map(int, c)) for c in self.chunk_scenarios], self.contents
         )
 
     def shape(self, variable: Variable) -> tuple[int, ...]:
         """Sizes of the axes of a variable after the scenario."""
-        return tuple(len(self.coords[axis][0]) for axis in variable.dims)
+        return tuple(
+            self.lengths[axis] if axis in self.lengths else len(self.coords[axis][0])
+            for axis in variable.dims
+        )
 
     def check(self) -> None:
         """Refuse a layout that cannot be stored.
@@ -147,17 +165,7 @@ class StoreLayout:
                 )
         for variable in self.variables:
             for axis in variable.dims:
-                if axis not in self.coords:
+                if axis not in self.coords and axis not in self.lengths:
                     raise InputError(
                         f"{variable.name}.dims", axis, f"one of the axes {', '.join(self.coords)}"
                     )
-
-
-def digest(*parts: Any) -> str:
-    """SHA-256 of JSON-like parts."""
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
-
-
-def content_hash(scenario_hashes: list[str], schema: str) -> str:
-    """Hash of a chunk: which scenarios, in which order, and what is stored of them."""
-    return digest(scenario_hashes, schema)

@@ -1,6 +1,6 @@
-"""The results of a sweep study as an `xarray.Dataset` over ``scenario`` with names and units, and its key figures as
-a table. Padding is hidden, trajectories are read when they are used, and what is missing or damaged reads as empty
-with ``complete`` 0, never as a number.
+"""The results of a study as an `xarray.Dataset` over its scenarios, or the controllers of a comparison, with names and
+units, and the key figures of a sweep as a table. Padding is hidden, trajectories are read when they are used, and what
+is missing or damaged reads as empty with ``complete`` 0, never as a number.
 """
 
 from __future__ import annotations
@@ -19,23 +19,48 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from jaxmpc.errors import InputError
+from studies.store.files import RESULTS, DamagedError, Survey, checked, chunk_file, open_manifest, survey
 from studies.store.layout import FLAG
-from studies.store.records import Survey, chunk_file, mark, open_manifest, survey
 from studies.store.template import is_trajectory
 
 
-def open_study(path: str | Path) -> xr.Dataset:
-    """Open the results of a sweep study.
+def open_results(path: str | Path) -> xr.Dataset:
+    """Open the results of a comparison.
 
     Args:
-        path: of the store, ending in ``.zarr``, or of the folder that holds it as ``study.zarr``.
+        path: the folder of the study, or its ``.zarr`` store.
+
+    Returns:
+        As `open_study`, over ``controller``, with the variables that belong to all runs: setpoints, tuning, model.
+
+    Raises:
+        InputError: if there are no results or they cannot be read.
+    """
+    path = Path(path)
+    return open_study(path if path.suffix == ".zarr" else path / RESULTS)
+
+
+def provenance(data: xr.Dataset, key: str) -> Any:
+    """A JSON fact from the attributes of a result, decoded; `None` if it is not there."""
+    value = data.attrs.get(key)
+    try:
+        return json.loads(value) if isinstance(value, str) else value
+    except json.JSONDecodeError:
+        return value
+
+
+def open_study(path: str | Path) -> xr.Dataset:
+    """Open the results of a study.
+
+    Args:
+        path: of the store, ending in ``.zarr``, or of the folder that holds it as ``study.zarr`` or ``results.zarr``.
 
     Returns:
         A data set over ``scenario`` (the scenario number) with every column as a coordinate (those of a search are
         empty where nothing is stored yet), the key figures, and
         the trajectories over ``time`` [s] and ``cv`` or ``mv``, which are read when they are used. ``complete`` is
         1 where the scenario is stored (and ran to its end, if the study says so); other rows are empty (NaN, -1).
-        JSON facts on where the numbers come from are in the attributes (`studies.store.comparison.provenance` decodes one).
+        JSON facts on where the numbers come from are in the attributes (`provenance` decodes one).
 
     Raises:
         InputError: if there is no store or its fixed files are damaged. Damage found in a trajectory while it is
@@ -46,14 +71,19 @@ def open_study(path: str | Path) -> xr.Dataset:
     """
     store, manifest = open_manifest(path)
     root = zarr.open_group(str(store), mode="r", zarr_format=3)
-    arrays: dict[str, Any] = {n: root[n] for key in ("columns", "coords", "variables") for n in manifest[key]}
-    numbers = _fixed(root["scenario"])
-    slots = np.flatnonzero(numbers >= 0)
-    slots = slots[np.argsort(numbers[slots])]
+    rows, variables = manifest["rows"], manifest["variables"]
+    arrays: dict[str, Any] = {n: root[n] for key in ("columns", "coords", "shared") for n in manifest[key]}
+    arrays |= {name: root[name] for name in (rows, f"{rows}_hash", *variables)}
+    dims = {name: tuple(array.metadata.dimension_names) for name, array in arrays.items()}
+    attrs = {name: dict(array.attrs) for name, array in arrays.items()}
+    labels = _fixed(arrays[rows])
+    numbered = labels.dtype.kind == "i"
+    slots = np.flatnonzero(labels >= 0 if numbered else labels != "")
+    if numbered:
+        slots = slots[np.argsort(labels[slots])]
 
     found = survey(store, manifest["contents"])
-    dims = {name: tuple(arrays[name].metadata.dimension_names[1:]) for name in manifest["variables"]}
-    tables = read_small(store, found, {name: arrays[name] for name in manifest["variables"]})
+    tables = read_small(store, found, {name: arrays[name] for name in variables})
     if found.damaged:
         warnings.warn(
             f"Damaged in {store}: {', '.join(found.damage)}. These scenarios read as empty; give the command of "
@@ -62,55 +92,49 @@ def open_study(path: str | Path) -> xr.Dataset:
         )
     stored = np.isin(slots // manifest["chunk_size"], list(found.records))
 
-    def variable(name: str) -> xr.Variable:
-        attrs = dict(arrays[name].attrs)
+    data = {name: xr.Variable(dims[name], _fixed(arrays[name]), attrs[name]) for name in manifest["shared"]}
+    for name in variables:
         if name in tables:
-            return xr.Variable(("scenario", *dims[name]), tables[name][slots], attrs)
-        rows = _StoredRows(store, arrays[name], slots, stored)
-        return xr.Variable(("scenario", *dims[name]), indexing.LazilyIndexedArray(rows), attrs)
-
-    data = {name: variable(name) for name in manifest["variables"]}
+            values = tables[name][slots]
+        else:
+            values = indexing.LazilyIndexedArray(_StoredRows(store, arrays[name], slots, stored))
+        data[name] = xr.Variable((rows, *dims[name][1:]), values, attrs[name])
     flag = stored if FLAG not in data else stored & (data[FLAG].values > 0)
-    data[FLAG] = xr.Variable(
-        "scenario",
-        flag.astype("i1"),
-        {"long_name": "1 once the scenario is computed and stored", "units": "1"},
-    )
-    hashes = _fixed(root["scenario_hash"])
+    about = attrs.get(FLAG, {"long_name": "1 once the scenario is computed and stored", "units": "1"})
+    data[FLAG] = xr.Variable(rows, flag.astype("i1"), about)
     coords: dict[str, Any] = {
-        "scenario": ("scenario", numbers[slots], {"long_name": "number of the scenario"}),
-        "scenario_hash": ("scenario", hashes[slots], dict(root["scenario_hash"].attrs)),
+        name: (rows, _fixed(arrays[name])[slots], attrs[name])
+        for name in (rows, f"{rows}_hash", *manifest["columns"])
     }
-    for name in manifest["columns"]:
-        coords[name] = ("scenario", _fixed(arrays[name])[slots], dict(arrays[name].attrs))
     for name, texts in json.loads(str(root.attrs.get("tuned", "{}"))).items():
         coords[name] = _tuned(data.pop(name), texts)
     for name in manifest["coords"]:
-        coords[name] = (arrays[name].metadata.dimension_names, _fixed(arrays[name]), dict(arrays[name].attrs))
+        coords[name] = (dims[name], _fixed(arrays[name]), attrs[name])
     return xr.Dataset(data, coords, dict(root.attrs))
 
 
 def kpi_frame(path: str | Path) -> pd.DataFrame:
     """The scenarios as a table: a row each, the columns of the study, then its key figures, then ``complete``.
 
-    A key figure with an axis gives one column per channel, ``<name>.<channel>``. Arguments and errors as for
-    `open_study`.
+    A key figure with an axis gives one column per channel, ``<name>.<channel>``. For a comparison the controllers are the
+    rows and what is known of each of them the columns. Arguments and errors as for `open_study`.
     """
     data = open_study(path)
+    rows = str(data[FLAG].dims[0])
     table: dict[str, Any] = {
         str(name): c.values
         for name, c in data.coords.items()
-        if c.dims == ("scenario",) and name not in ("scenario", "scenario_hash")
+        if c.dims == (rows,) and name not in (rows, f"{rows}_hash")
     }
     for name, variable in data.data_vars.items():
         axes = [str(axis) for axis in variable.dims[1:]]
-        if is_trajectory(tuple(axes)):
+        if variable.dims[0] != rows or is_trajectory(tuple(axes)):
             continue
         for place in itertools.product(*(range(variable.sizes[axis]) for axis in axes)):
             labels = [str(data[axis].values[i]) for axis, i in zip(axes, place, strict=True)]
             table[".".join([str(name), *labels])] = variable.values[(slice(None), *place)]
     table[FLAG] = table.pop(FLAG)
-    return pd.DataFrame(table, index=pd.Index(data.scenario.values, name="scenario"))
+    return pd.DataFrame(table, index=pd.Index(data[rows].values, name=rows))
 
 
 def chunk_facts(path: str | Path) -> dict[int, dict[str, Any]]:
@@ -153,19 +177,16 @@ def read_small(store: Path, found: Survey, arrays: dict[str, Any]) -> dict[str, 
         wrong, values = {}, {}
         for name, array in arrays.items():
             file = chunk_file(name, array.ndim - 1, chunk)
-            content = (store / file).read_bytes()
-            if mark(content) != tuple(record["files"][file]):
-                wrong[file] = "checksum differs"
-            else:  # the last four bytes are the CRC-32C
-                values[name] = np.frombuffer(content[:-4], array.dtype.newbyteorder("<")).reshape(
-                    array.chunks
-                )
+            try:
+                content = checked((store / file).read_bytes())
+                values[name] = np.frombuffer(content, array.dtype.newbyteorder("<")).reshape(array.chunks)
+            except DamagedError as error:
+                wrong[file] = str(error)
         if wrong:
             found.damaged[chunk] = wrong
             del found.records[chunk]
-        else:
-            for name, value in values.items():
-                tables[name][rows] = value
+        for name, value in ({} if wrong else values).items():
+            tables[name][rows] = value
     return tables
 
 

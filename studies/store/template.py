@@ -1,25 +1,28 @@
-"""The fixed part of a sweep store (groups, columns, axes, metadata of the variables) and the bytes of one chunk.
+"""The fixed part of a store (groups, columns, axes, metadata of the variables) and the bytes of one chunk.
 
-Every variable is a plain Zarr v3 array over ``slot`` with one Zarr chunk per study chunk and a CRC-32C behind the
-data, so any Zarr reader notices a flipped bit. Trajectories are compressed; the rest is a few hundred bytes per
-chunk and is stored as it is.
+Every variable is a plain Zarr v3 array over the slots with one Zarr chunk per study chunk and a CRC-32C behind the
+data. Trajectories are compressed; the rest is a few hundred bytes per chunk and is stored as it is.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
+import google_crc32c
 import numpy as np
 import zarr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.storage import MemoryStore
 
-from studies.store.comparison import consolidate
+from jaxmpc.files import write_atomically
+from studies.store.files import COMMITS, FORMAT, MANIFEST, chunk_file, text_content
 from studies.store.layout import StoreLayout, Variable
-from studies.store.records import COMMITS, FORMAT, MANIFEST, chunk_file, mark, write_checked
+
+_TEXT = np.dtypes.StringDType()
 
 
 def is_trajectory(dims: tuple[str, ...]) -> bool:
@@ -35,7 +38,7 @@ def _variable_options(layout: StoreLayout, variable: Variable, slots: int) -> di
         "chunks": (layout.chunk_size, *shape),
         "dtype": np.dtype(variable.dtype),
         "fill_value": variable.empty,
-        "dimension_names": ["slot", *variable.dims],
+        "dimension_names": [layout.slot_axis, *variable.dims],
         "attributes": {"long_name": variable.long_name, "units": variable.unit},
         "compressors": [*squeeze, Crc32cCodec()],
         "chunk_key_encoding": {"name": "default", "separator": "."},
@@ -46,7 +49,7 @@ def _variable_options(layout: StoreLayout, variable: Variable, slots: int) -> di
 def _plain(values: Any) -> np.ndarray:
     """Numbers as they are, everything else as text of any length."""
     values = np.asarray(values)
-    return values if values.dtype.kind in "biuf" else values.astype(object).astype(np.dtypes.StringDType())
+    return values if values.dtype.kind in "biuf" else values.astype(object).astype(_TEXT)
 
 
 def on_slots(layout: StoreLayout, values: Any, empty: Any) -> np.ndarray:
@@ -64,62 +67,86 @@ def write_template(folder: Path, layout: StoreLayout) -> None:
     Raises:
         OSError: if the disk does not take it.
     """
-    slots = layout.chunk_size * len(layout.chunk_scenarios)
+    chunks, rows, slot = len(layout.chunk_scenarios), layout.rows, layout.slot_axis
     facts = {"format": FORMAT, "name": layout.name, "title": layout.title, "study_hash": layout.study_hash}
     given = {k: v if isinstance(v, (str, float)) else json.dumps(v) for k, v in layout.provenance.items()}
     root = zarr.create_group(str(folder), attributes={**given, **facts, "identity": layout.identity})
-    root.create_group(COMMITS, attributes={"long_name": "one record for each stored chunk"})
 
-    def fixed(name: str, values: np.ndarray, axis: str, unit: str, long_name: str) -> None:
+    def texts(name: str, long_name: str, shape: tuple[int, ...], axes: list[str]) -> None:
+        root.create_array(
+            name,
+            shape=shape,
+            chunks=(1,) * len(shape),
+            dtype=_TEXT,
+            dimension_names=axes,
+            attributes={"long_name": long_name},
+            compressors=[Crc32cCodec()],
+            chunk_key_encoding={"name": "default", "separator": "."},
+        )
+
+    def fixed(name: str, values: Any, dims: tuple[str, ...], attributes: dict[str, Any]) -> None:
+        values = _plain(values)
         root.create_array(
             name,
             data=values,
-            chunks=(max(len(values), 1),),
-            dimension_names=[axis],
-            attributes={"long_name": long_name, **({"units": unit} if unit else {})},
+            chunks=tuple(max(size, 1) for size in values.shape),
+            dimension_names=dims,
+            attributes=attributes,
             compressors=[ZstdCodec(level=3), Crc32cCodec()],
             chunk_key_encoding={"name": "default", "separator": "."},
             config={"write_empty_chunks": True},
         )
 
-    numbers = np.arange(len(layout.scenario_hashes))
-    fixed(
-        "scenario",
-        on_slots(layout, numbers, -1),
-        "slot",
-        "1",
-        "number of the scenario, -1 where there is none",
-    )
-    hashes = on_slots(layout, np.array(layout.scenario_hashes, dtype=object), "")
-    fixed("scenario_hash", hashes, "slot", "", "SHA-256 of the inputs of the scenario")
+    texts("manifest", "what this store holds, as JSON", (), [])
+    texts(COMMITS, "record of each stored chunk, as JSON", (chunks,), ["chunk"])
+    labels = layout.names or np.arange(len(layout.scenario_hashes))
+    fixed(rows, on_slots(layout, labels, "" if layout.names else -1), (slot,), {"long_name": f"the {rows}"})
+    hashes = on_slots(layout, layout.scenario_hashes, "")
+    fixed(f"{rows}_hash", hashes, (slot,), {"long_name": f"SHA-256 of the inputs of the {rows}"})
     for column in layout.columns:
         values = _plain(column.values)
         empty = {"f": np.nan, "b": False}.get(values.dtype.kind, 0 if values.dtype.kind in "iu" else "")
-        fixed(column.key, on_slots(layout, values, empty), "slot", column.unit, column.label)
+        fixed(column.key, on_slots(layout, values, empty), (slot,), _attributes(column.label, column.unit))
     for name, (values, unit, long_name) in layout.coords.items():
-        fixed(name, _plain(values), name.removesuffix("_unit"), unit, long_name)
+        fixed(name, values, (name.removesuffix("_unit"),), _attributes(long_name, unit))
+    shared = layout.shared()
+    axes = {str(name): axis for array in shared.values() for name, axis in array.coords.items()}
+    for name, array in {**shared, **axes}.items():
+        fixed(name, array.values, tuple(map(str, array.dims)), array.attrs)
     for variable in layout.variables:
-        root.create_array(variable.name, **_variable_options(layout, variable, slots))
-    consolidate(folder)
+        root.create_array(variable.name, **_variable_options(layout, variable, chunks * layout.chunk_size))
+    with warnings.catch_warnings():  # that other readers may not know of it, which then read the arrays' own
+        warnings.filterwarnings("ignore", "Consolidated metadata", UserWarning)
+        zarr.consolidate_metadata(str(folder), zarr_format=3)  # where `xarray.open_zarr` looks
 
-    files = {}
+    files, checksums = {}, {}
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+        name = path.relative_to(folder).as_posix()
         with open(path, "rb") as file:
-            files[path.relative_to(folder).as_posix()] = mark(file.read())
+            content = file.read()
             os.fsync(file.fileno())
+        files[name] = len(content)
+        if path.name == "zarr.json":
+            checksums[name] = google_crc32c.value(content)
     body = {
         **facts,
         "identity": layout.identity,
-        "schema": layout.schema,
         "chunk_size": layout.chunk_size,
         "chunk_counts": [len(c) for c in layout.chunk_scenarios],
         "contents": layout.contents,
+        "rows": rows,
         "columns": [column.key for column in layout.columns],
         "variables": [variable.name for variable in layout.variables],
-        "coords": list(layout.coords),
+        "coords": [*layout.coords, *axes],
+        "shared": list(shared),
         "files": files,
+        "checksums": checksums,
     }
-    write_checked(folder / MANIFEST, body)
+    write_atomically(folder / MANIFEST, text_content(body))
+
+
+def _attributes(long_name: str, unit: str) -> dict[str, str]:
+    return {"long_name": long_name, **({"units": unit} if unit else {})}
 
 
 class ChunkEncoder:
@@ -127,7 +154,6 @@ class ChunkEncoder:
 
     def __init__(self, layout: StoreLayout):
         """Prepare the encoding of every variable of a layout."""
-        self._layout = layout
         self._arrays: dict[str, tuple[zarr.Array, dict[str, Any]]] = {}
         for variable in layout.variables:
             memory: dict[str, Any] = {}

@@ -65,7 +65,7 @@ def run_named(
         say: receives one line per event.
 
     Returns:
-        The folder of the study, with ``results.zarr`` (see `studies.store.comparison.open_results`) and ``model.json``.
+        The folder of the study, with ``results.zarr`` (see `studies.store.reading.open_results`) and ``model.json``.
 
     Raises:
         InputError: for an unknown name or plant or a folder that cannot be written, before anything is computed.

@@ -19,7 +19,8 @@ from jaxmpc.process.plant import WellPlant
 from jaxmpc.process.well.host import HostWell
 from studies.definition.comparison import ComparisonDefinition, PlantKind, ReferenceDefinition
 from studies.run.comparison import is_current, run_controller
-from studies.store.comparison import check_writable, open_results
+from studies.store.reading import open_results
+from studies.store.writing import check_writable
 from studies.thesis import catalogue
 from studies.thesis.claims import ROWS, Claim, Evidence, judge, tables
 from studies.thesis.comparison import study_name
@@ -98,7 +99,7 @@ class _Clock:
 
     def __call__(self, name: str) -> np.ndarray:
         with open_results(self.results) as data:
-            key = str(data.sel(controller=name).content_hash.item())
+            key = str(data.sel(controller=name).controller_hash.item())
         known = _read(self.file, self.say)
         if key not in known:
             self.say(f"{self.definition.name}, {name}: timed on the host.")

@@ -25,7 +25,8 @@ from studies.definition.comparison import (
     PlantKind,
 )
 from studies.run.comparison import run_comparison
-from studies.store.comparison import RESULTS, check_writable, locked
+from studies.store.files import RESULTS
+from studies.store.writing import check_writable, locked
 
 # Grid of the steady-state map: finer where the choke's gain is large.
 MAP_CHOKE = np.r_[1.0:10.0:1.0, 10.0:30.0:2.0, 30.0:101.0:5.0]  # %
@@ -61,7 +62,7 @@ def run_definition(
         say: receives one line per event.
 
     Returns:
-        The folder of the study, with ``results.zarr`` (see `studies.store.comparison.open_results`) and ``model.json``.
+        The folder of the study, with ``results.zarr`` (see `studies.store.reading.open_results`) and ``model.json``.
 
     Raises:
         InputError: for a definition that cannot be run or a folder that cannot be written, before anything is computed.
@@ -69,7 +70,7 @@ def run_definition(
     """
     definition.check()
     folder = check_writable(Path(out) / definition.name)
-    with locked(folder):
+    with locked(folder / RESULTS):
         make_plant, facts = plant_factory(definition.plant, say)
         tested = make_plant("continuous")
         try:

@@ -14,7 +14,7 @@ import xarray as xr
 from jaxmpc.errors import InputError
 from studies.definition.presets import CHOKE
 from studies.kpi import loop as kpi
-from studies.store.comparison import provenance
+from studies.store.reading import provenance
 
 SMALLEST_MOVE = 1e-6  # % choke, less is rounding
 LONGEST_SWING = 1000.0  # s
@@ -53,7 +53,7 @@ def plan_at(data: xr.Dataset, controller: str, time: float) -> StoredPlan:
     """The plan that a controller made at a time, with its prediction.
 
     Args:
-        data: results from `studies.store.comparison.open_results`.
+        data: results from `studies.store.reading.open_results`.
         controller: name of a finished run.
         time: of the plan [s]; that of the sample that holds it counts.
 
@@ -95,7 +95,7 @@ def oscillation_moves(data: xr.Dataset, controller: str, around: float) -> tuple
     `LONGEST_SWING` after each other are no oscillation.
 
     Args:
-        data: results from `studies.store.comparison.open_results`.
+        data: results from `studies.store.reading.open_results`.
         controller: name of a finished run.
         around: the oscillation whose second swing begins nearest to this time is taken [s].
 

@@ -11,7 +11,7 @@ from jaxmpc.files import write_atomically
 from jaxmpc.model.step_response import StepResponseModel
 from studies.definition.presets import GAS, OIL
 from studies.kpi.evaluate import key_figures
-from studies.store.comparison import open_results
+from studies.store.reading import open_results
 from studies.thesis.catalogue import STUDIES
 from studies.thesis.claims import claims
 from studies.thesis.tables import csv_text, markdown_table

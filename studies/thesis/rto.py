@@ -8,8 +8,6 @@ demands' deadzones that need no such lift, and the choke and lift that belong to
 
 from __future__ import annotations
 
-import datetime
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -32,9 +30,12 @@ from jaxmpc.steady.optimise import LIFT_RANGES, Targets, optimise
 from studies.definition import presets
 from studies.definition.comparison import PlantKind
 from studies.definition.presets import CHOKE, GAS, LIFT, OIL
-from studies.run.comparison import closing, progress_bar
-from studies.store.comparison import ResultStore, check_writable, locked, open_results, results_template
-from studies.store.fingerprint import content_hash, module_hash, source_hash, versions
+from studies.run.comparison import closing, progress_bar, results_layout, run_missing
+from studies.store.files import RESULTS
+from studies.store.fingerprint import content_hash, module_hash, source_hash
+from studies.store.layout import StoreLayout
+from studies.store.reading import open_results
+from studies.store.writing import check_writable, locked
 from studies.thesis.comparison import over_inputs, plant_factory, study_name
 from studies.thesis.tables import markdown_table
 
@@ -95,12 +96,12 @@ def run_rto(
         out, progress, say: as for `studies.thesis.catalogue.run_named`.
 
     Returns:
-        The folder of the study, with ``results.zarr`` (see `studies.store.comparison.open_results`), ``model.json``,
+        The folder of the study, with ``results.zarr`` (see `studies.store.reading.open_results`), ``model.json``,
         ``steady_map.json`` and ``summary.md``, where both runs settle; errors as for `run_named`.
     """
     folder = check_writable(Path(out) / study_name("rto", quick, plant))
     demanded = demands(quick)
-    with locked(folder):
+    with locked(folder / RESULTS):
         make_plant, facts = plant_factory(plant, say)
         with closing(make_plant("continuous")) as tested:
             model, steady = identify_step_response(tested), steady_map(tested)
@@ -115,7 +116,7 @@ def run_rto(
                 f"with {each.mv[0]:.0f} % choke and {each.mv[1]:.0f} m3/h lift. {each.message}"
             )
         shared = _shared(demanded, found, np.asarray(tuning.deadzone), steady, structure.dt)
-        store = _store(folder, demanded, found, facts, model, structure, shared, say)
+        layout = _layout(folder.name, demanded, found, facts, model, structure, shared)
 
         def close(name: str, well: Any, report: Progress | None) -> Trajectory:
             if name == WITHOUT:
@@ -129,31 +130,26 @@ def run_rto(
             controller = TargetController(structure, tuning, model, TARGET_WEIGHT)
             return simulate_with_targets(controller, well, setpoints, ideal, progress=report)
 
-        for name, label in LABELS.items():
-            if store.complete(name):
-                say(f"{label}: stored already.")
-                continue
-            started = time.perf_counter()
+        def run(i: int) -> Trajectory:
+            name, label = list(LABELS.items())[i]
             with closing(make_plant("step")) as well, progress_bar(label, progress) as report:
-                run = close(name, well, report)
-            wall_time = time.perf_counter() - started
-            store.write(name, run, wall_time)
-            say(f"{label}: {run.samples} samples in {wall_time:.1f} s.")
+                return close(name, well, report)
+
+        run_missing(folder, layout, run, say)
     write_atomically(folder / "summary.md", markdown(open_results(folder).load()))
     return folder
 
 
-def _store(
-    folder: Path,
+def _layout(
+    name: str,
     demanded: Reference,
     found: list[Targets],
     facts: dict[str, Any],
     model: StepResponseModel,
     structure: Structure,
     shared: dict[str, xr.DataArray],
-    say: Callable[[str], None],
-) -> ResultStore:
-    """The store of both runs, which keeps what was computed with equal inputs."""
+) -> StoreLayout:
+    """The store of both runs, known by their inputs."""
     code = {package: source_hash(package) for package in ("jaxmpc", "identify")}
     code |= {name: module_hash(name) for name in OPTIMISING}
     inputs = {
@@ -166,38 +162,28 @@ def _store(
         "code": code,
     }
     hashes = [content_hash(inputs, WITHOUT), content_hash(inputs, WITH, TARGET_WEIGHT)]
-    study_hash = content_hash(folder.name, hashes)
+    study_hash = content_hash(name, hashes)
     provenance = {
-        "study": folder.name,
+        "study": name,
         "title": "Low demands: mixed-integer MPC with and without real-time optimisation",
-        "dt": structure.dt,
         "plant": facts,
         "prices": PRICES,
         "target_weight": TARGET_WEIGHT,
         "lift_ranges": [list(pair) for pair in LIFT_RANGES],
         "messages": [each.message for each in found],
         "code": code,
-        "versions": versions(),
-        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
 
-    def template() -> xr.Dataset:
-        return results_template(
-            controllers=list(LABELS),
-            labels=list(LABELS.values()),
-            hashes=hashes,
-            time=structure.dt * np.arange(demanded.samples(structure.dt)),
-            cv_names=structure.cv_names,
-            mv_names=structure.mv_names,
-            cv_units=structure.cv_units,
-            mv_units=structure.mv_units,
-            blocks=structure.block_count,
-            shared=shared,
-            provenance=provenance,
-            study_hash=study_hash,
-        )
-
-    return ResultStore.begin(folder, list(LABELS), study_hash, template, say)
+    return results_layout(
+        controllers=LABELS,
+        hashes=hashes,
+        structure=structure,
+        samples=demanded.samples(structure.dt),
+        blocks=structure.block_count,
+        shared=lambda: shared,
+        provenance=provenance,
+        study_hash=study_hash,
+    )
 
 
 def _shared(

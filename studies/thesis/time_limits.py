@@ -42,7 +42,7 @@ def limited_steps(
     """What the time limits of stored runs cost, one entry per controller with a limit; NaN where no step reached it.
 
     Args:
-        data: results from `studies.store.comparison.open_results`, every run finished.
+        data: results from `studies.store.reading.open_results`, every run finished.
         definitions: of the controllers that ran.
         model: their prediction model, ``model.json`` in the folder of the study.
     """
@@ -70,7 +70,7 @@ def objective_loss(
     are solved again without one. Zero for steps that were solved to the end, not a number for steps without a plan.
 
     Args:
-        data: results from `studies.store.comparison.open_results`.
+        data: results from `studies.store.reading.open_results`.
         definition: of the controller that ran.
         model: its prediction model, ``model.json`` in the folder of the study.
     """

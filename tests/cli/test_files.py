@@ -1,16 +1,19 @@
 """Writing of files: what is replaced, what is followed, what is written to, and what is refused beforehand."""
 
 import errno
+import json
+import math
 import os
 import socket
 import stat
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from jaxmpc.errors import InputError
-from jaxmpc.files import check_folder, check_target, write_atomically
+from jaxmpc.files import check_folder, check_target, from_strict_json, strict_json, write_atomically
 
 posix = pytest.mark.skipif(os.name != "posix", reason="modes, links and pipes of POSIX")
 pytestmark = posix
@@ -273,3 +276,18 @@ def test_what_is_checked_stays_as_it_is(tmp_path):
     check_target("--out", tmp_path / "new" / "folder" / "x")
     assert path.stat() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["old"]
+
+
+@pytest.mark.parametrize(
+    "value",
+    [{"a": [1, 2.5, math.inf, -math.inf]}, ["inf", "'inf", "''nan", "info", "'"], None, True, {"": {}}],
+)
+def test_numbers_and_texts_survive_strict_json(value):
+    written = json.dumps(strict_json(value), allow_nan=False)
+    assert from_strict_json(json.loads(written)) == value
+
+
+def test_an_array_becomes_lists_that_are_read_back_to_the_last_bit():
+    array = np.array([[0.1, np.nan], [np.inf, 1 / 3]])
+    again = from_strict_json(json.loads(json.dumps(strict_json(array), allow_nan=False)))
+    np.testing.assert_array_equal(np.array(again), array)

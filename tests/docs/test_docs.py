@@ -20,6 +20,7 @@ import jaxmpc
 from figures.registry import FIGURES
 from jaxmpc.cli import main as cli
 from studies.definition.sweep import StudyDefinition, shipped_studies
+from studies.load import expand
 from studies.thesis import catalogue
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -117,7 +118,7 @@ def test_study_files_of_the_pages_are_accepted():
     for page in PAGES:
         for found in FENCE.finditer(page.read_text()):
             if found[1] == "toml" and "[study]" in found[3]:
-                StudyDefinition.from_dict(tomllib.loads(found[3])).expand()
+                expand(StudyDefinition.from_dict(tomllib.loads(found[3])))
                 count += 1
     assert count >= 3
 

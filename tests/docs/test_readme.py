@@ -13,6 +13,7 @@ import jaxmpc
 from jaxmpc.cli import main as cli
 from jaxmpc.cli.options import parser as make_parser
 from studies.definition.sweep import StudyDefinition
+from studies.load import expand
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text()
@@ -41,7 +42,7 @@ def test_the_example_runs_as_typed(capsys):
 
 def test_the_study_is_accepted_as_typed():
     (text,) = blocks("toml")
-    study = StudyDefinition.from_dict(tomllib.loads(text)).expand()
+    study = expand(StudyDefinition.from_dict(tomllib.loads(text)))
     assert (study.name, study.count) == ("wear", 32)
     for key in ("tuning.move_weight.choke", "soft"):
         assert key in [column.key for column in study.columns]

@@ -7,18 +7,13 @@ import pytest
 from figures import panels, registry, style
 from figures.thesis import runs
 from jaxmpc.errors import InputError
-from studies.store.comparison import ResultStore, open_results
+from studies.store.reading import open_results
 from tests import studies_synthetic as made
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("made-up")
-    names = list(made.RUNS)
-    store = ResultStore.begin(folder, names, "study", made.template, lambda line: None)
-    for name, kind in made.RUNS.items():
-        store.write(name, made.trajectory(kind), 1.0)
-    return folder
+    return made.stored(tmp_path_factory.mktemp("made-up"))
 
 
 def test_every_thesis_figure_is_drawn_as_png_and_pdf(results):
@@ -46,8 +41,7 @@ def test_an_unknown_figure_is_refused_before_anything_is_drawn(results, tmp_path
 
 
 def test_a_figure_of_a_run_that_is_not_finished_is_refused(tmp_path):
-    store = ResultStore.begin(tmp_path, list(made.RUNS), "study", made.template, lambda line: None)
-    store.write("step-choke", made.trajectory("hunting"), 1.0)
+    made.write(made.begin(tmp_path), "step-choke", made.trajectory("hunting"))
     with pytest.raises(InputError, match="mixed-integer"):
         registry.draw(["17", "22"], tmp_path, tmp_path / "figures")
     assert not (tmp_path / "figures").exists()

@@ -13,9 +13,9 @@ from figures.thesis import events, integer_example, plans, soft
 from jaxmpc.errors import InputError
 from jaxmpc.loop.trajectory import Trajectory
 from studies.run import comparison
-from studies.run.comparison import comparison_template
-from studies.store.comparison import ResultStore, open_results
+from studies.run.comparison import comparison_layout
 from studies.store.fingerprint import source_hash
+from studies.store.reading import open_results
 from studies.thesis import catalogue
 from studies.thesis import integer_example as example
 from studies.thesis.integer_example import EXAMPLE, IntegerProgram, Row
@@ -84,18 +84,11 @@ class Runner:
         folder.mkdir(parents=True, exist_ok=True)
         names = [controller.name for controller in definition.controllers]
         code = {package: source_hash(package) for package in ("jaxmpc", "identify")}
-        store = ResultStore.begin(
-            folder,
-            names,
-            json.dumps([name, code]),
-            lambda: comparison_template(
-                definition, made.model(), made.extra(), names, json.dumps([name, code]), {"kind": plant}, code
-            ),
-            say,
-        )
-        for controller in definition.controllers[:only]:
-            if not store.complete(controller.name):
-                store.write(controller.name, made_up(definition, controller), 1.0)
+        facts = json.dumps([name, code]), {"kind": plant}, code
+        layout = comparison_layout(definition, made.model(), made.extra, names, *facts)
+        store = made.begin(folder, layout, say)
+        for i in store.pending()[:only]:
+            made.write(store, names[i], made_up(definition, definition.controllers[i]))
         return folder
 
 

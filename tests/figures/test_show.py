@@ -173,7 +173,7 @@ def test_a_run_of_no_samples_and_one_that_failed_show_themselves(run):
 
 
 def test_a_study_shows_what_varies_and_what_it_takes():
-    from studies.definition.scenarios import load_study
+    from studies.load import load_study
 
     study = load_study("deadzone", quick=True)
     reader = read(study)

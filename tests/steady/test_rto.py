@@ -14,7 +14,7 @@ from identify.sweep import steady_sweep
 from jaxmpc.errors import InputError
 from jaxmpc.steady.map import SteadyMap
 from jaxmpc.steady.optimise import optimise
-from studies.store.comparison import open_results
+from studies.store.reading import open_results
 from studies.thesis.rto import PRICES, demands, run_rto, targets_of
 
 RANGES = ((0.0, 0.0), (2000.0, 10_000.0))

@@ -13,9 +13,8 @@ from figures.registry import FIGURES
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import make_model
 from studies.definition.comparison import ReferenceDefinition
-from studies.run import comparison
+from studies.run.comparison import comparison_layout
 from studies.store import fingerprint
-from studies.store.comparison import ResultStore
 from studies.thesis import catalogue, claims, claims_study
 from studies.thesis.claims import ROWS, record, tables, why
 from tests import studies_synthetic as made
@@ -39,11 +38,8 @@ def model():
 def resting(study, extra=None):
     """Finished runs that stand at their setpoints, 50 % and 7500 m3/h, plan no move, and take 1 ms per step."""
     names = [controller.name for controller in study.controllers]
-    data = comparison.comparison_template(
-        study, model(), extra or {}, names, "study", {"kind": "jax"}, {"jaxmpc": "none"}
-    )
-    data = data.assign_coords(controller=np.array(names, dtype=object))
-    data = data.assign_coords(cv=["gas_rate", "oil_rate"], mv=["choke", "gas_lift"])
+    facts = {"kind": "jax"}, {"jaxmpc": "none"}
+    data = made.empty(comparison_layout(study, model(), lambda: extra or {}, names, "study", *facts))
     data["measurement"].values[:] = data.setpoint.values
     for name, value in {"position": (50.0, 7500.0), "demand": (50.0, 7500.0), "solve_time": 1e-3}.items():
         data[name].values[:] = value
@@ -491,16 +487,11 @@ def test_results_are_current_for_their_definition_and_code_only(tmp_path):
     study = made.definition(controllers=made.CONTROLLERS[:1])
     assert not claims_study.is_current(study, tmp_path)
 
-    def template(code):
-        return comparison.comparison_template(study, made.model(), {}, ["a"], "study", {"kind": "jax"}, code)
-
     def stored(folder, code):
         folder.mkdir()
-        store = ResultStore.begin(
-            folder, ["continuous-choke"], "study", lambda: template(code), lambda line: None
-        )
+        store = made.begin(folder, made.layout(hashes="a", of=study, code=code))
         assert not claims_study.is_current(study, folder)
-        store.write("continuous-choke", made.trajectory("smooth"), 1.0)
+        made.write(store, "continuous-choke", made.trajectory("smooth"))
         return folder
 
     good = stored(tmp_path / "good", {"jaxmpc": fingerprint.source_hash("jaxmpc")})
@@ -511,14 +502,8 @@ def test_results_are_current_for_their_definition_and_code_only(tmp_path):
 
 def test_steps_are_timed_once_and_then_read_from_a_file(tmp_path, monkeypatch):
     study = made.definition(controllers=made.CONTROLLERS[:1])
-    store = ResultStore.begin(
-        tmp_path,
-        ["continuous-choke"],
-        "study",
-        lambda: comparison.comparison_template(study, made.model(), {}, ["key"], "s", {"kind": "jax"}, {}),
-        lambda line: None,
-    )
-    store.write("continuous-choke", made.trajectory("smooth"), 1.0)
+    store = made.begin(tmp_path, made.layout(hashes=["key"], of=study))
+    made.write(store, "continuous-choke", made.trajectory("smooth"))
     made.model().save(tmp_path / "model.json")
     calls = []
     monkeypatch.setattr(

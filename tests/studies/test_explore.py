@@ -26,7 +26,6 @@ from studies.definition.presets import CHOKE
 from studies.notebooks import launch
 from studies.notebooks import loop as explore
 from studies.notebooks.loop import RUN, Settings, main, run, shown_figures, written
-from studies.store.comparison import ResultStore
 from tests import studies_synthetic
 from tests.sweep_synthetic import DEADZONE, OIL_DEADZONE, WEIGHT, grid, numbers, runs, write
 
@@ -266,10 +265,7 @@ def test_a_stored_scenario_is_drawn_as_it_is_stored(sweep):
 
 
 def test_the_controllers_of_a_comparison_become_points_too(tmp_path):
-    made = studies_synthetic
-    store = ResultStore.begin(tmp_path, list(made.RUNS), "study", made.template, print)
-    for name, kind in made.RUNS.items():
-        store.write(name, made.trajectory(kind), 1.0)
+    studies_synthetic.stored(tmp_path)
     table = draw.points(tmp_path)
     assert len(table) == 3
     data = draw.stored(tmp_path, 1)

@@ -19,7 +19,7 @@ from jaxmpc.process.plant import WellPlant
 from studies.definition import presets
 from studies.definition.comparison import ComparisonDefinition, ControllerDefinition, ReferenceDefinition
 from studies.run import comparison
-from studies.store.comparison import open_results
+from studies.store.reading import open_results
 from studies.thesis import catalogue, report, time_limits
 
 AT = np.array([11000.0, 185.0]), np.array([50.0, 7500.0])  # CVs, MVs
@@ -194,7 +194,7 @@ def test_the_table_of_limits_has_one_row_per_limited_controller(results, model):
 def test_a_controller_with_a_schedule_runs_differently_and_is_stored_under_another_hash(results):
     _, data = results
     exact, scheduled = (data.sel(controller=name) for name in ("exact", "scheduled"))
-    assert exact.content_hash.item() != scheduled.content_hash.item()
+    assert exact.controller_hash.item() != scheduled.controller_hash.item()
     assert (scheduled.status.values == status.OPTIMAL).all()
     assert np.abs(exact.demand.values - scheduled.demand.values).max() > 1.0
 

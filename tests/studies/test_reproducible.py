@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from studies.store.comparison import open_results
+from studies.store.reading import open_results
 from studies.thesis import catalogue, claims_study, rto
 from studies.thesis import comparison as thesis
 from studies.thesis.claims import ROWS

@@ -18,7 +18,7 @@ from jaxmpc.process.plant import WellPlant
 from studies.definition import comparison as definition
 from studies.definition import presets
 from studies.run import comparison
-from studies.store.comparison import ResultStore, open_results, provenance
+from studies.store.reading import open_results, provenance
 from studies.thesis import catalogue, plans
 from tests import studies_synthetic as made
 
@@ -321,12 +321,12 @@ def test_plans_that_are_not_there_are_refused(planned):
 def test_plans_of_fewer_blocks_are_filled_up_and_read_as_they_were(tmp_path):
     unblocked = msgspec.structs.replace(made.CONTROLLERS[1], blocking="none")
     study = made.definition(controllers=(made.CONTROLLERS[0], unblocked))
-    names = [controller.name for controller in study.controllers]
-    store = ResultStore.begin(tmp_path, names, "study", lambda: made.template(hashes="ab", of=study))
+    store = made.begin(tmp_path, made.layout(hashes="ab", of=study))
+    names = store.layout.names
     planned = {16: 0.5, 200: 0.25}
     for name, (blocks, move) in zip(names, planned.items(), strict=True):
         plan = np.full((400, blocks, 2), move)
-        store.write(name, dataclasses.replace(made.trajectory("smooth"), plan=plan), 1.0)
+        made.write(store, name, dataclasses.replace(made.trajectory("smooth"), plan=plan))
     data = open_results(tmp_path).load()
     assert data.sizes["block"] == 200
     for name, move in zip(names, planned.values(), strict=True):
@@ -334,11 +334,7 @@ def test_plans_of_fewer_blocks_are_filled_up_and_read_as_they_were(tmp_path):
 
 
 def test_an_oscillation_is_found_by_its_three_moves(tmp_path):
-    names = list(made.RUNS)
-    store = ResultStore.begin(tmp_path, names, "study", made.template)
-    for name, kind in made.RUNS.items():
-        store.write(name, made.trajectory(kind), 1.0)
-    data = open_results(tmp_path).load()
+    data = open_results(made.stored(tmp_path)).load()
     # from sample 30 on the choke moves every ten samples, up and down in turn
     assert plans.oscillation_moves(data, "step-choke", 2010.0) == (1900.0, 2000.0, 2100.0)
     assert plans.oscillation_moves(data, "step-choke", 1e6) == (3700.0, 3800.0, 3900.0)

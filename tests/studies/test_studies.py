@@ -14,18 +14,14 @@ from studies.definition.comparison import ControllerDefinition, ReferenceDefinit
 from studies.kpi import evaluate
 from studies.run import comparison
 from studies.store import fingerprint
-from studies.store.comparison import ResultStore, open_results
+from studies.store.reading import open_results
 from studies.thesis import catalogue, claims, report
 from tests import studies_synthetic as made
 
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("made-up")
-    store = ResultStore.begin(folder, list(made.RUNS), "study", made.template, lambda line: None)
-    for name, kind in made.RUNS.items():
-        store.write(name, made.trajectory(kind), 1.0)
-    return folder
+    return made.stored(tmp_path_factory.mktemp("made-up"))
 
 
 @pytest.fixture(scope="module")
@@ -343,4 +339,4 @@ def test_the_summary_of_a_study_lies_beside_its_results(stored, results, study, 
 
 def test_results_without_a_finished_run_are_refused():
     with pytest.raises(InputError, match="no finished run"):
-        evaluate.key_figures(made.template())
+        evaluate.key_figures(made.empty())

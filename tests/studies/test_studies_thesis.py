@@ -5,7 +5,7 @@ import pytest
 
 from figures.registry import FIGURES, draw_study
 from studies.kpi import evaluate
-from studies.store.comparison import open_results
+from studies.store.reading import open_results
 from studies.thesis import claims
 from studies.thesis.catalogue import run_named
 

@@ -8,6 +8,7 @@ from scipy.stats import norm, qmc
 
 from jaxmpc.errors import InputError
 from studies.definition.sweep import StudyDefinition
+from studies.load import expand
 
 WEIGHT = "tuning.move_weight.choke"
 DEADZONE = "tuning.deadzone.gas_rate"
@@ -18,7 +19,7 @@ def study(*axes, folder=".", confirmed=False, limit=10_000, **sections):
     body = {"study": {"name": "made", "confirmation_limit": limit}, **sections}
     if axes:
         body["axes"] = list(axes)
-    return StudyDefinition.from_dict(body, folder).expand(confirmed=confirmed)
+    return expand(StudyDefinition.from_dict(body, folder), confirmed=confirmed)
 
 
 def values(made):

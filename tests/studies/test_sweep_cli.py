@@ -16,13 +16,13 @@ import pytest
 
 from jaxmpc.cli.main import main
 from jaxmpc.cli.study import COMPARISONS
-from studies.definition.scenarios import load_study
 from studies.definition.sweep import shipped_studies
+from studies.load import load_study
 from studies.run import runner
 from studies.run.chunk import study_layout
 from studies.run.runner import RunError
 from studies.store.reading import chunk_facts, open_study
-from studies.store.sweep import SweepStore
+from studies.store.writing import Store
 from tests.sweep_hazards import TEXT, computed, processes
 
 ROOT = Path(__file__).parents[2]
@@ -137,7 +137,7 @@ def test_ctrl_c_ends_a_run_with_status_130_and_what_to_do(workers, file, serial,
 
 def test_a_second_run_on_a_store_is_refused_and_the_first_goes_on(file, tmp_path, no_figures, capsys):
     store = tmp_path / "x.zarr"
-    with SweepStore.begin(store, study_layout(load_study(file)), lambda _: None) as first:
+    with Store.begin(store, study_layout(load_study(file)), lambda _: None) as first:
         before = sorted(path for path in store.rglob("*"))
         assert main(["study", "run", str(file), "--store", str(store)]) == 2
         assert "no other run is writing" in capsys.readouterr().err

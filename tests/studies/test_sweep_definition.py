@@ -10,12 +10,13 @@ import pytest
 
 from jaxmpc.errors import InputError
 from jaxmpc.process.well.equations import WellParameters
+from studies import load
 from studies.definition import presets, references
+from studies.definition.estimate import MODEL_SECONDS
 from studies.definition.fields import FIELDS, PLANT_FIELDS
 from studies.definition.models import identify_models
-from studies.definition.scenarios import load_study
 from studies.definition.sweep import StudyDefinition, load_definition, shipped_studies
-from studies.run.estimate import MODEL_SECONDS
+from studies.load import load_study
 from studies.store import fingerprint
 
 WEIGHT = "tuning.move_weight.choke"
@@ -29,7 +30,7 @@ def define(base=None, axes=ONE, name="made", **sections):
 
 
 def expand(*arguments, **options):
-    return define(*arguments, **options).expand()
+    return load.expand(define(*arguments, **options))
 
 
 def refused(*arguments, **options) -> InputError:
@@ -484,13 +485,13 @@ def test_the_quick_cut_replaces_what_it_names_and_nothing_else():
     lift = {"key": "model.lift", "range": {"from": 5000, "to": 9000, "count": 5}}
     axes = [axis(WEIGHT, 1, 2, 3), lift, axis("soft", True, False)]
     definition = define({"reference": "quick"}, axes, quick=quick)
-    full, cut = definition.expand(), definition.expand(quick=True)
+    full, cut = load.expand(definition), load.expand(definition, quick=True)
     assert (full.name, full.count, full.scenario(0).samples, full.chunk_size) == ("made", 30, 1200, 2)
     assert (cut.name, cut.count, cut.scenario(0).samples, cut.chunk_size) == ("made-quick", 4, 10, 3)
     assert cut.columns[0].values.tolist() == [3, 3, 1, 1]
     assert cut.columns[1].values.tolist() == [5000, 9000, 5000, 9000]
     with pytest.raises(InputError, match="no quick version"):
-        define().expand(quick=True)
+        load.expand(define(), quick=True)
 
 
 def test_a_dry_run_counts_scenarios_compilations_models_and_bytes():
@@ -548,9 +549,11 @@ def test_the_page_of_the_documentation_lists_every_key_with_its_unit():
 
 def test_the_examples_of_the_documentation_expand():
     examples = re.findall(r"```toml\n(\[study\].*?)```", DOCS.read_text(), flags=re.S)
-    counts = [StudyDefinition.from_dict(tomllib.loads(text)).expand().count for text in examples]
+    counts = [load.expand(StudyDefinition.from_dict(tomllib.loads(text))).count for text in examples]
     assert counts == [10, 256, 384]
-    assert all(StudyDefinition.from_dict(tomllib.loads(text)).expand(quick=True).count for text in examples)
+    assert all(
+        load.expand(StudyDefinition.from_dict(tomllib.loads(text)), quick=True).count for text in examples
+    )
 
 
 # -------------------------------------------------------------------------------------------------------------- models

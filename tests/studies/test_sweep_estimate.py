@@ -7,10 +7,12 @@ import time
 import pytest
 
 from jaxmpc.programs import compilation
+from studies.definition import estimate
+from studies.definition.estimate import COMPILE_SECONDS, MODEL_SECONDS, Pace, Work, chunk_seconds, readable
 from studies.definition.sweep import StudyDefinition
-from studies.run import comparison, estimate
+from studies.load import expand
+from studies.run import comparison
 from studies.run.chunk import study_layout
-from studies.run.estimate import COMPILE_SECONDS, MODEL_SECONDS, Pace, Work, chunk_seconds, readable
 from studies.run.progress import progress_bar
 from studies.run.status import status
 from tests.sweep_hazards import BODY
@@ -113,7 +115,7 @@ def test_a_dry_run_adds_identification_and_what_the_table_says_of_every_group():
     body = copy.deepcopy(BODY)
     body["axes"] = [{"keys": ["controller", "seed"], "values": [["continuous", k] for k in range(4)]}]
     body["axes"][0]["values"].append(["mixed-integer", 0])
-    study = StudyDefinition.from_dict(body).expand()
+    study = expand(StudyDefinition.from_dict(body))
     assert [len(group.scenarios) for group in study.groups] == [4, 1]
     assert [study.lanes(group) for group in (0, 1)] == [3, 1]
     continuous, integer = chunk_seconds("continuous", 30, 3), chunk_seconds("mixed-integer", 30, 1)
@@ -122,7 +124,7 @@ def test_a_dry_run_adds_identification_and_what_the_table_says_of_every_group():
 
 
 def test_status_estimates_the_rest_by_group_from_what_the_store_says_of_its_chunks(tmp_path, monkeypatch):
-    study = StudyDefinition.from_dict(BODY).expand()
+    study = expand(StudyDefinition.from_dict(BODY))
     assert study_layout(study).provenance["work"]["groups"] == [0, 0, 0]
     monkeypatch.setattr(estimate, "COMPILE_SECONDS", 0.0)
     values = numbers(24)

@@ -12,6 +12,7 @@ from jaxmpc.errors import InputError
 from studies.definition.axes import MOST
 from studies.definition.fields import FIELDS
 from studies.definition.sweep import StudyDefinition, load_definition
+from studies.load import expand
 
 WEIGHT = "tuning.move_weight.choke"
 BODY = tomllib.loads("""
@@ -122,7 +123,7 @@ QUIETLY = settings(
 @given(body=bodies(), quick=st.booleans())
 def test_a_changed_definition_is_taken_or_refused_and_writes_nothing(body, quick, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    found = taken_or_refused(lambda: StudyDefinition.from_dict(body).expand(quick=quick))
+    found = taken_or_refused(lambda: expand(StudyDefinition.from_dict(body), quick=quick))
     if not isinstance(found, InputError):
         assert found.count <= 100
         assert str(found.describe())
@@ -132,7 +133,7 @@ def test_a_changed_definition_is_taken_or_refused_and_writes_nothing(body, quick
 @QUIETLY
 @given(body=THINGS)
 def test_anything_in_place_of_a_definition_is_refused(body):
-    assert isinstance(taken_or_refused(lambda: StudyDefinition.from_dict(body).expand()), InputError)
+    assert isinstance(taken_or_refused(lambda: expand(StudyDefinition.from_dict(body))), InputError)
 
 
 @QUIETLY
@@ -151,7 +152,7 @@ def test_anything_in_place_of_a_definition_is_refused(body):
 def test_any_file_is_read_or_refused(text, tmp_path):
     path = tmp_path / "any.toml"
     path.write_bytes(text)
-    assert isinstance(taken_or_refused(lambda: load_definition(path).expand()), InputError)
+    assert isinstance(taken_or_refused(lambda: expand(load_definition(path))), InputError)
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -184,7 +185,7 @@ def test_what_is_too_large_is_refused_in_little_memory_even_when_it_is_confirmed
     path.write_text(text if text.startswith("a =") else head + text)
     tracemalloc.start()
     try:
-        found = taken_or_refused(lambda: load_definition(path).expand(confirmed=True))
+        found = taken_or_refused(lambda: expand(load_definition(path), confirmed=True))
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -200,4 +201,4 @@ def test_the_largest_range_is_named(tmp_path):
     with pytest.raises(
         InputError, match=rf"axes\[0\].range.count: got {MOST + 1}, expected at most {MOST} values"
     ):
-        StudyDefinition.from_dict(body).expand()
+        expand(StudyDefinition.from_dict(body))

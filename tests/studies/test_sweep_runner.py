@@ -17,17 +17,17 @@ from jaxmpc.controller.mixed_integer import MixedIntegerController
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.loop.trajectory import TrajectoryBatch
 from jaxmpc.process.plant import WellPlant
+from studies import load
 from studies.definition import scenarios
 from studies.definition.sweep import StudyDefinition
 from studies.kpi.sweep import RECORD, batch_kpis
+from studies.rerun import rerun, study_of
 from studies.run import runner
 from studies.run.chunk import SETTLED, prepare_study, run_chunk, run_scenarios, study_layout
 from studies.run.executors import LostError
-from studies.run.rerun import rerun, study_of
 from studies.run.runner import RunError, run_study
-from studies.store.comparison import provenance
-from studies.store.reading import chunk_facts, open_study
-from studies.store.sweep import SweepStore
+from studies.store.reading import chunk_facts, open_study, provenance
+from studies.store.writing import Store
 from tests.sweep_hazards import BODY, computed, preparation, processes
 
 CLOCK = ("solve_time_median", "solve_time_p99", "solve_time_max")  # all that may differ between runs
@@ -38,7 +38,7 @@ MIXED["axes"][1]["values"] = MIXED["axes"][1]["values"][:2]
 
 def expand(**changes):
     """The tiny study with other sections."""
-    return StudyDefinition.from_dict({**BODY, **changes}).expand()
+    return load.expand(StudyDefinition.from_dict({**BODY, **changes}))
 
 
 def run(study, path, **options):
@@ -165,7 +165,7 @@ def test_a_chunk_computed_twice_differs_in_solve_times_only(prepared):
 
 @pytest.mark.slow
 def test_integer_moves_are_stored_as_scenarios_run_alone_have_them(tmp_path):
-    study = StudyDefinition.from_dict(MIXED).expand()
+    study = load.expand(StudyDefinition.from_dict(MIXED))
     assert {group.kind for group in study.groups} == {"mixed-integer"}
     store = run(study, tmp_path / "mixed.zarr")
     compare_with_single_runs(study, prepare_study(study).models, store, [0, 3])
@@ -176,7 +176,7 @@ def test_runs_of_different_length_share_a_store_and_shorter_ones_end_empty(tmp_p
     body = copy.deepcopy(BODY)
     body["axes"] = [{"key": "duration", "values": [300, 200]}]
     body["store"] = {"every": 4, "trajectories": ["cv", "status", "objective"]}
-    study = StudyDefinition.from_dict(body).expand()
+    study = load.expand(StudyDefinition.from_dict(body))
     assert len(study.groups) == 2
     with open_study(run(study, tmp_path / "x.zarr")) as data:
         assert np.isfinite(data.measurement.values[0]).all()
@@ -271,18 +271,18 @@ def test_a_finished_study_is_not_computed_again(study, serial, monkeypatch):
 def test_a_full_disk_ends_the_run_with_what_to_do_and_keeps_what_is_stored(
     study, serial, monkeypatch, tmp_path
 ):
-    whole = SweepStore.commit
+    whole = Store.commit
 
     def commit(self, index, fields, facts):
         if index == 1:
-            monkeypatch.setattr("studies.store.sweep.write_atomically", refuse)
+            monkeypatch.setattr("studies.store.writing.write_atomically", refuse)
         whole(self, index, fields, facts)
 
     def refuse(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(SweepStore, "commit", commit)
+        patch.setattr(Store, "commit", commit)
         with pytest.raises(InputError, match=r"No space left.*Free space.*same command again"):
             run(study, tmp_path / "x.zarr")
     monkeypatch.undo()
@@ -303,9 +303,9 @@ def test_one_more_value_on_an_axis_computes_new_chunks_only(study, serial, hazar
     path = tmp_path / "x.zarr"
     sections = dict(BODY, study={"name": "tiny", "chunk_size": 3})
     axis, *others = BODY["axes"]
-    run(StudyDefinition.from_dict(sections).expand(), path)
+    run(load.expand(StudyDefinition.from_dict(sections)), path)
     sections["axes"] = [{**axis, "values": [100, 200, 300]}, *others]
-    more = StudyDefinition.from_dict(sections).expand()
+    more = load.expand(StudyDefinition.from_dict(sections))
     hazard("none")
     said = []
     run(more, path, say=said.append)
@@ -333,7 +333,7 @@ def strict(text):
 
 def test_a_store_says_where_its_numbers_come_from(study, serial):
     with open_study(serial) as data:
-        assert StudyDefinition.from_dict(provenance(data, "definition")).expand().hash == study.hash
+        assert load.expand(StudyDefinition.from_dict(provenance(data, "definition"))).hash == study.hash
         assert data.attrs["study_hash"] == study.hash
         assert provenance(data, "versions")["jax"]
         assert provenance(data, "seeds") == {"sampling": 0, "noise": "the column seed"}
@@ -347,9 +347,9 @@ def test_infinite_limits_stay_valid_json_and_come_back(tmp_path):
     body = copy.deepcopy(BODY)
     body["base"]["tuning"] = {"cv_low": {"gas_rate": -math.inf}, "cv_high": {"oil_rate": math.inf}}
     body["axes"] = [{"key": "tuning.cv_high.gas_rate", "values": [math.inf, 20000]}]
-    study = StudyDefinition.from_dict(body).expand()
+    study = load.expand(StudyDefinition.from_dict(body))
     path = tmp_path / "x.zarr"
-    SweepStore.begin(path, study_layout(study)).close()
+    Store.begin(path, study_layout(study)).close()
     attributes = strict((path / "zarr.json").read_text())["attributes"]
     strict(attributes["definition"])
     for file in (path / "commits").glob("*.json"):

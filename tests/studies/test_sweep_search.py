@@ -13,16 +13,15 @@ import pytest
 from jaxmpc.errors import InputError, MissingToolError
 from studies.definition import presets
 from studies.definition.models import identify_models
-from studies.definition.scenarios import load_study
 from studies.definition.sweep import StudyDefinition, shipped_studies
 from studies.kpi.objectives import front, unbeaten
 from studies.kpi.sweep import KPIS
+from studies.load import expand, load_study
 from studies.run.chunk import run_scenarios, stored_variables
 from studies.search import run as search
 from studies.search.run import run_search
 from studies.search.study import SearchStudy
-from studies.store.comparison import provenance
-from studies.store.reading import chunk_facts, kpi_frame, open_study
+from studies.store.reading import chunk_facts, kpi_frame, open_study, provenance
 
 WEIGHT, LIFT = "tuning.move_weight.choke", "tuning.move_weight.gas_lift"
 DEADZONE = ("tuning.deadzone.gas_rate", "tuning.deadzone.oil_rate")
@@ -62,7 +61,7 @@ def define(**changes) -> StudyDefinition:
 
 
 def study(**changes) -> SearchStudy:
-    return define(**changes).expand()
+    return expand(define(**changes))
 
 
 def run(made, path, **options):
@@ -239,7 +238,7 @@ def test_a_definition_with_a_mistake_is_refused_with_its_path_and_what_is_expect
         body[name] = {**body[name], **value} if isinstance(body.get(name), dict) and value else value
     body = {name: value for name, value in body.items() if value is not None}
     with pytest.raises(InputError) as caught:
-        StudyDefinition.from_dict(body).expand()
+        expand(StudyDefinition.from_dict(body))
     assert caught.value.field.startswith(field)
     assert words in str(caught.value)
 
@@ -250,12 +249,12 @@ def test_a_dry_run_counts_batches_of_scenarios_and_one_compilation():
     assert (found.scenarios, found.chunks, found.compilations, found.models) == (12, 3, 1, 1)
     assert found.samples == 12 * 20
     assert "3 batches of 4 scenarios" in str(found)
-    assert define(study={"confirmation_limit": 11}).expand(confirmed=True).count == 12
+    assert expand(define(study={"confirmation_limit": 11}), confirmed=True).count == 12
 
 
 def test_the_quick_cut_replaces_batches_axes_and_batch_size():
     quick = {"batches": 2, "chunk_size": 3, "axes": {WEIGHT: {"values": [1, 2]}}}
-    cut = define(quick=quick).expand(quick=True)
+    cut = expand(define(quick=quick), quick=True)
     assert (cut.name, cut.batches, cut.chunk_size, cut.count) == ("sought-quick", 2, 3, 6)
     assert cut.parameters[0].entries == ((1.0,), (2.0,))
 
@@ -347,7 +346,7 @@ def test_a_damaged_batch_is_computed_again_and_the_later_ones_stay(tmp_path, qui
 def test_batches_that_answer_other_questions_are_computed_again(tmp_path, quick):
     made = study(search={"batches": 4})
     path = run(made, tmp_path / "a.zarr")
-    (path / "commits" / "000000.json").unlink()
+    (path / "commits" / "c.0").unlink()
     quick(scale=-1.0)  # another machine: the first batch now says the opposite
     lines = []
     run(made, path, say=lines.append)
@@ -419,7 +418,7 @@ def test_the_front_is_what_no_scenario_beats_in_the_directions_of_the_search(tmp
     best = front(path)
     assert sorted(best.tolist()) == wanted
     assert (np.diff(points[best, 0]) >= 0).all()
-    with pytest.raises(InputError, match="store of a sweep study"):
+    with pytest.raises(InputError, match="store of a study"):
         front(tmp_path / "none.zarr")
 
 

@@ -16,13 +16,13 @@ from jaxmpc.errors import InputError
 from studies.bench.context import Context
 from studies.bench.judge import taken
 from studies.bench.rows import Goal, Row
-from studies.definition.scenarios import Study
+from studies.definition.scenarios import Study, expand_sweep
 from studies.definition.sweep import StudyDefinition
 from studies.run.chunk import stored_variables
 from studies.run.runner import run_study
 from studies.store.layout import Column, StoreLayout
 from studies.store.reading import chunk_facts, kpi_frame
-from studies.store.sweep import SweepStore
+from studies.store.writing import Store
 
 CHUNK = 64
 QUIET: dict[str, Any] = {"progress": False, "say": lambda _: None}
@@ -125,7 +125,7 @@ def _study(chunks: int, samples: int) -> Study:
             }
         ],
     }
-    return StudyDefinition.from_dict(body).expand()
+    return expand_sweep(StudyDefinition.from_dict(body))
 
 
 def _layout(count: int, size: int) -> StoreLayout:
@@ -155,9 +155,9 @@ def _fields(layout: StoreLayout, chunk: int) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def _made_up(path: Path, layout: StoreLayout, chunks: int) -> Iterator[SweepStore]:
+def _made_up(path: Path, layout: StoreLayout, chunks: int) -> Iterator[Store]:
     """A store with its first chunks filled."""
-    with SweepStore.begin(path, layout, say=lambda _: None) as store:
+    with Store.begin(path, layout, say=lambda _: None) as store:
         for i in range(chunks):
             store.commit(i, _fields(layout, i), {})
         yield store

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from studies.definition.presets import LIFT, OIL
-from studies.store.comparison import provenance
+from studies.store.reading import provenance
 from studies.thesis.claims.limits import LATE, PRECISE, REST, STATIONARY
 from studies.thesis.claims.record import Evidence, Finding, choke_travel, index, late, late_deviation
 from studies.thesis.claims.why import compromise, exchange, price_of_a_step

@@ -12,17 +12,16 @@ import xarray as xr
 from jaxmpc.controller.continuous import ContinuousController
 from jaxmpc.controller.mixed_integer import MixedIntegerController
 from jaxmpc.errors import InputError
-from jaxmpc.files import write_atomically
+from jaxmpc.files import from_strict_json, write_atomically
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.trajectory import AXES, Trajectory
 from jaxmpc.process.plant import WellPlant
 from studies.definition.models import identify_models
 from studies.definition.scenarios import Study
 from studies.definition.sweep import StudyDefinition
-from studies.run.chunk import from_strict_json
+from studies.load import expand
 from studies.search.study import SearchStudy
-from studies.store.comparison import provenance
-from studies.store.reading import open_study
+from studies.store.reading import open_study, provenance
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -76,7 +75,7 @@ def study_of(store: Path) -> Study:
     if not isinstance(body, dict):
         raise InputError("store", str(store), "a store of a sweep study, with its definition")
     definition = StudyDefinition.from_dict(from_strict_json(body), folder or ".")
-    made = definition.expand(quick=bool(quick), confirmed=True)
+    made = expand(definition, quick=bool(quick), confirmed=True)
     return made.evaluated(store) if isinstance(made, SearchStudy) else made
 
 
