@@ -97,6 +97,54 @@ def _mean(pairs: Iterable[tuple[Any, float]], expected: float) -> float:
     return min(mean, max(mean - COMPILE_SECONDS, expected))
 
 
+@dataclasses.dataclass(frozen=True)
+class Description:
+    """What a run would do; see `scenarios.Study.describe`.
+
+    Attributes:
+        name: of the study.
+        scenarios: how many.
+        group_sizes: scenarios of every group.
+        chunks: how many.
+        compilations: compiled programs, one per group.
+        models: step-response models to identify.
+        samples: samples of all scenarios together.
+        stored_bytes: key figures and trajectories before compression [B].
+        seconds: rough time on 2 CPU cores [s]: identification, and what the table says of the chunks.
+        searched: whether each chunk is a batch that is asked for after the one before.
+    """
+
+    name: str
+    scenarios: int
+    group_sizes: tuple[int, ...]
+    chunks: int
+    compilations: int
+    models: int
+    samples: int
+    stored_bytes: int
+    seconds: float
+    searched: bool = False
+
+    def __str__(self) -> str:
+        sizes = ", ".join(str(size) for size in self.group_sizes[:12])
+        more = ", ..." if len(self.group_sizes) > 12 else ""
+        batches = f"{self.chunks} batches of {self.scenarios // self.chunks} scenarios"
+        return "\n".join(
+            (
+                f"study       {self.name}",
+                f"scenarios   {self.scenarios} ({self.samples} samples in all)",
+                f"search      {batches}, each asked after the one before"
+                if self.searched
+                else f"groups      {len(self.group_sizes)} of equal structure and length, of {sizes}{more} scenarios",
+                f"chunks      {self.chunks}",
+                f"to compile  {self.compilations}",
+                f"models      {self.models} to identify",
+                f"stored      {megabytes(self.stored_bytes)} before compression",
+                f"time        about {self.seconds / 60:.1f} minutes on 2 CPU cores; the run measures it by its own chunks",
+            )
+        )
+
+
 class Pace:
     """The time left of a run, from the chunks that it has computed and from the time that has passed meanwhile.
 

@@ -113,6 +113,10 @@ class Settings:
         out = np.array(values if change is None else [change(v) for v in values], dtype=np.float64)
         return out if found is None else out[found[2]]
 
+    def columns(self, keys: Sequence[str]) -> np.ndarray:
+        """Some numeric keys ``"scenario key"``."""
+        return np.stack(np.broadcast_arrays(*[self.numbers(key) for key in keys]), axis=1)
+
     def combinations(self, keys: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
         """First scenario of each distinct combination of some keys' values, and each scenario's combination."""
         found = [column for key in keys if (column := self.table.column(key)) is not None]
@@ -143,10 +147,10 @@ def resolve(definition: StudyDefinition, table: AxisTable) -> Inputs:
         variant=variant,
         tuning=_tuning(settings, kinds[variant] if len(set(kinds)) > 1 else kinds[:1]),
         plant=_plant(settings),
-        point=_stacked(settings, ("model.choke", "model.lift")),
-        noise=_stacked(settings, [f"noise.{name}" for name in CV_NAMES]),
+        point=settings.columns(("model.choke", "model.lift")),
+        noise=settings.columns([f"noise.{name}" for name in CV_NAMES]),
         seed=settings.numbers("seed").astype(np.int64),
-        pressure=_pressure(settings, variants, variant),
+        pressure=_events(settings, variants, variant, "disturbance", ("time", "offset")),
         fault_kinds=tuple((fault.cv, fault.kind) for fault in settings.base.get("sensor_fault", ())),
         faults=_sensor_faults(settings, variants, variant),
         told=settings.numbers("position_feedback").astype(bool),
@@ -155,10 +159,6 @@ def resolve(definition: StudyDefinition, table: AxisTable) -> Inputs:
     check_deviation(inputs.noise, len(CV_NAMES))
     check_seed(inputs.seed)
     return inputs
-
-
-def _stacked(settings: Settings, keys: Sequence[str]) -> np.ndarray:
-    return np.stack(np.broadcast_arrays(*[settings.numbers(key) for key in keys]), axis=1)
 
 
 # --------------------------------------------------------------------------------------------------------- shapes
@@ -307,9 +307,7 @@ def _located(settings: Settings, plant: dict[str, np.ndarray], error: InputError
             check_parameters(WellParameters(**{n: float(row(values, k)) for n, values in plant.items()}))
         except InputError as found:
             name = found.field.removeprefix("well.")
-            names = (
-                [name, "trip_end"] if name == "trip_start" and found.expected.endswith("trip_end") else [name]
-            )
+            names = [name, *["trip_end"] * found.expected.endswith("trip_end")]  # what it is compared with
             keys = [
                 key for n in names for key in (f"plant.{n}", f"plant_scale.{n}") if settings.given(key)
             ] or [f"plant.{name}"]
@@ -320,17 +318,11 @@ def _located(settings: Settings, plant: dict[str, np.ndarray], error: InputError
     return error
 
 
-def _pressure(settings: Settings, variants: tuple[Variant, ...], variant: np.ndarray) -> np.ndarray:
-    """Pressure steps "scenario step 2"; every step lies within every run."""
-    return _events(settings, variants, variant, "disturbance", ("time", "offset"))
-
-
 def _sensor_faults(settings: Settings, variants: tuple[Variant, ...], variant: np.ndarray) -> np.ndarray:
     """Sensor faults "scenario fault 3"; every one begins within every run."""
     out = _events(settings, variants, variant, "sensor_fault", ("time", "duration", "size"))
-    _refuse(
-        settings, "sensor_fault.duration", out[:, :, 1], out[:, :, 1] <= 0, lambda _: "a duration above 0 s"
-    )
+    lengths, expected = out[:, :, 1], "a duration above 0 s"
+    _refuse(settings, "sensor_fault.duration", lengths, lengths <= 0, lambda _: expected)
     return out
 
 

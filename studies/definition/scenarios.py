@@ -25,7 +25,7 @@ from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES, WellParameters
 from studies.definition import models
 from studies.definition.axes import AxisTable, expand_axes
 from studies.definition.comparison import held_offsets
-from studies.definition.estimate import MODEL_SECONDS, Work, chunk_seconds, megabytes
+from studies.definition.estimate import MODEL_SECONDS, Description, Work, chunk_seconds
 from studies.definition.resolve import Inputs, Variant, resolve, row
 from studies.definition.sweep import StudyDefinition
 from studies.store import fingerprint
@@ -116,54 +116,6 @@ class Chunk:
     index: int
     group: int
     scenarios: np.ndarray
-
-
-@dataclasses.dataclass(frozen=True)
-class Description:
-    """What a run would do; see `Study.describe`.
-
-    Attributes:
-        name: of the study.
-        scenarios: how many.
-        group_sizes: scenarios of every group.
-        chunks: how many.
-        compilations: compiled programs, one per group.
-        models: step-response models to identify.
-        samples: samples of all scenarios together.
-        stored_bytes: key figures and trajectories before compression [B].
-        seconds: rough time on 2 CPU cores [s]: identification, and what the table of `estimate` says of the chunks.
-        searched: whether each chunk is a batch that is asked for after the one before.
-    """
-
-    name: str
-    scenarios: int
-    group_sizes: tuple[int, ...]
-    chunks: int
-    compilations: int
-    models: int
-    samples: int
-    stored_bytes: int
-    seconds: float
-    searched: bool = False
-
-    def __str__(self) -> str:
-        sizes = ", ".join(str(size) for size in self.group_sizes[:12])
-        more = ", ..." if len(self.group_sizes) > 12 else ""
-        batches = f"{self.chunks} batches of {self.scenarios // self.chunks} scenarios"
-        return "\n".join(
-            (
-                f"study       {self.name}",
-                f"scenarios   {self.scenarios} ({self.samples} samples in all)",
-                f"search      {batches}, each asked after the one before"
-                if self.searched
-                else f"groups      {len(self.group_sizes)} of equal structure and length, of {sizes}{more} scenarios",
-                f"chunks      {self.chunks}",
-                f"to compile  {self.compilations}",
-                f"models      {self.models} to identify",
-                f"stored      {megabytes(self.stored_bytes)} before compression",
-                f"time        about {self.seconds / 60:.1f} minutes on 2 CPU cores; the run measures it by its own chunks",
-            )
-        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -27,19 +27,8 @@ from studies.kpi import setpoint as kpi_setpoint
 
 ROUNDING = 1e-6  # of a value at its limit, relative to the distance between the limits
 RATE_UNIT = "m3/h"  # of what is integrated to a volume
-RECORD = (  # fields of `Trajectory` that key figures need
-    "cv",
-    "mv",
-    "mv_demand",
-    "move",
-    "status",
-    "fallback",
-    "objective",
-    "gap",
-    "solve_time",
-    "quality",
-    "off",
-)
+_NUMBERS = ("cv", "mv", "mv_demand", "move", "objective", "gap", "solve_time")
+RECORD = (*_NUMBERS, "status", "fallback", "quality", "off")  # fields of `Trajectory` that key figures need
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,18 +133,8 @@ KPIS: tuple[Kpi, ...] = (
     Kpi("finite", "1 if the run is complete: every CV and MV is finite", "1", "all_k finite(y, r, u, m)"),
 )
 
-# What is known of a run whose numbers are not all finite; everything else is NaN there.
-ALWAYS = (
-    "solve_time_median",
-    "solve_time_p99",
-    "solve_time_max",
-    "largest_gap",
-    "not_optimal",
-    "fallbacks",
-    "bad_measurements",
-    "switched_off",
-    "finite",
-)
+# the last ones are about the steps and known also of a run whose numbers are not all finite, where all others are NaN
+ALWAYS = tuple(item.name for item in KPIS[-9:])
 
 
 class Run(NamedTuple):
@@ -263,11 +242,7 @@ def runs_of(batch: TrajectoryBatch, window) -> Run:
             f"{labels.dtype} of shape {list(labels.shape)}",
             f"whole numbers, one per sample [{shape[1]}] or per lane and sample {list(shape)}",
         )
-    numbers = {
-        key: np.asarray(batch[key], dtype=np.float64)
-        for key in RECORD
-        if key not in ("status", "fallback", "quality", "off")
-    }
+    numbers = {key: np.asarray(batch[key], dtype=np.float64) for key in _NUMBERS}
     return Run(
         **numbers,
         setpoint=np.asarray(batch.setpoint, dtype=np.float64),

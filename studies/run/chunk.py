@@ -29,16 +29,16 @@ from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.tuning import stack_tunings
 from jaxmpc.process.plant import WellPlant
 from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS
-from studies.definition import presets
 from studies.definition.models import Point, identify_models
 from studies.definition.scenarios import Scenario, Study
+from studies.kpi.objectives import THESIS_DEADZONE
 from studies.kpi.sweep import KPIS, RECORD, batch_kpis
 from studies.store.fingerprint import versions
 from studies.store.layout import FLAG, StoreLayout, Variable
 from studies.store.trajectories import swept
 
 # A CV counts as settled within the deadzone of the thesis, whatever its own: otherwise a wide deadzone settles at once.
-SETTLED = tuple(presets.tuning_fields("thesis")["deadzone"][name] for name in CV_NAMES)
+SETTLED = THESIS_DEADZONE
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any, Protocol
+from typing import Any
 
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.programs.interrupts import held
@@ -35,13 +35,16 @@ class LostError(RuntimeError):
     """What was to compute the chunks is gone for good, or is not what it has to be."""
 
 
-class Executor(Protocol):
-    """What the runner needs."""
+class Executor:
+    """What the runner needs: computes a chunk in this process when it is submitted, others elsewhere."""
+
+    def __init__(self, prepared: PreparedStudy):
+        self.prepared = prepared
 
     @property
     def width(self) -> int:
         """Chunks to hand out at once."""
-        ...
+        return 1
 
     def submit(self, index: int) -> concurrent.futures.Future[ChunkResult]:
         """Have a chunk computed.
@@ -49,31 +52,6 @@ class Executor(Protocol):
         Raises:
             LostError: if nothing is left that could.
         """
-        ...
-
-    def check(self) -> None:
-        """Make sure that chunks under way can still arrive.
-
-        Raises:
-            LostError: if they cannot.
-        """
-        ...
-
-    def stop(self) -> None:
-        """End now, without waiting for chunks under way."""
-        ...
-
-
-class Here:
-    """Computes in this process when a chunk is submitted."""
-
-    width = 1
-
-    def __init__(self, prepared: PreparedStudy):
-        self.prepared = prepared
-
-    def submit(self, index: int) -> concurrent.futures.Future[ChunkResult]:
-        """As in `Executor`; the result is there at once."""
         future: concurrent.futures.Future[ChunkResult] = concurrent.futures.Future()
         try:
             future.set_result(run_chunk(self.prepared, index))
@@ -82,10 +60,14 @@ class Here:
         return future
 
     def check(self) -> None:
-        """As in `Executor`."""
+        """Make sure that chunks under way can still arrive.
+
+        Raises:
+            LostError: if they cannot.
+        """
 
     def stop(self) -> None:
-        """As in `Executor`; nothing is under way."""
+        """End now, without waiting for chunks under way."""
 
 
 # ------------------------------------------------------------------------------------------------------ processes
@@ -115,12 +97,18 @@ def _run_received(index: int) -> ChunkResult:
     return run_chunk(_received, index)
 
 
-class Processes:
-    """Spawned processes; a pool that broke because a process died is replaced."""
+class Processes(Executor):
+    """Spawned processes; a process that dies ends its chunk at once, and a pool that it broke is replaced."""
 
     def __init__(self, prepared: PreparedStudy, workers: int):
-        self.prepared, self.workers, self.width = prepared, workers, workers * AHEAD
+        super().__init__(prepared)
+        self.workers = workers
         self.pool = self._make()
+
+    @property
+    def width(self) -> int:
+        """As in `Executor`."""
+        return self.workers * AHEAD
 
     def _make(self) -> concurrent.futures.ProcessPoolExecutor:
         return concurrent.futures.ProcessPoolExecutor(
@@ -136,9 +124,6 @@ class Processes:
                 self.pool.shutdown(wait=False, cancel_futures=True)
                 self.pool = self._make()
                 return self.pool.submit(_run_received, index)
-
-    def check(self) -> None:
-        """As in `Executor`; a process that dies ends its chunk at once."""
 
     def stop(self) -> None:
         """As in `Executor`; no process is left afterwards."""
@@ -207,12 +192,12 @@ def _run_held(prepared: PreparedStudy, index: int, code: str) -> ChunkResult:
     return run_chunk(prepared, index)
 
 
-class Cluster:
+class Cluster(Executor):
     """A `dask.distributed` cluster; its scheduler computes a chunk elsewhere when a worker dies."""
 
     def __init__(self, prepared: PreparedStudy, client: Any, say: Callable[[str], None]):
-        self.client, self.address = client, client.scheduler.address
-        self.prepared, self.code = client.submit(_hold, prepared, pure=False), code_hash()
+        super().__init__(client.submit(_hold, prepared, pure=False))
+        self.client, self.address, self.code = client, client.scheduler.address, code_hash()
         self.executor = client.get_executor(pure=False, retries=0)
         self._threads, self._asked = 0, -ASK_SECONDS
         if self.width == AHEAD and not self._threads:

@@ -18,7 +18,7 @@ from jaxmpc.errors import InputError
 from jaxmpc.programs.interrupts import last_words
 from studies.definition.scenarios import Study
 from studies.run.chunk import ChunkResult, PreparedStudy, prepare_study, study_layout
-from studies.run.executors import Cluster, Executor, Here, LostError, Processes, connect, disconnect
+from studies.run.executors import Cluster, Executor, LostError, Processes, connect, disconnect
 from studies.run.progress import progress_bar
 from studies.store.reading import chunk_facts
 from studies.store.writing import Store
@@ -129,7 +129,7 @@ def _executor(prepared: PreparedStudy, workers: int, client: Any, say: Say) -> I
     if client is not None:
         executor = Cluster(prepared, client, say)
     else:
-        executor = Here(prepared) if workers == 1 else Processes(prepared, workers)
+        executor = Executor(prepared) if workers == 1 else Processes(prepared, workers)
     try:
         yield executor
     finally:

@@ -19,9 +19,9 @@ from msgspec import UnsetType
 
 from jaxmpc.errors import InputError
 from studies.definition.axes import check_count
-from studies.definition.estimate import MODEL_SECONDS, Work, chunk_seconds
+from studies.definition.estimate import MODEL_SECONDS, Description, Work, chunk_seconds
 from studies.definition.fields import Field
-from studies.definition.scenarios import Description, Study
+from studies.definition.scenarios import Study
 from studies.definition.sections import Search
 from studies.definition.sweep import StudyDefinition
 from studies.kpi.objectives import Objective, objectives_of

@@ -23,6 +23,7 @@ from studies.store.files import COMMITS, FORMAT, MANIFEST, chunk_file, text_cont
 from studies.store.layout import StoreLayout, Variable
 
 _TEXT = np.dtypes.StringDType()
+_KEYS: Any = {"name": "default", "separator": "."}
 
 
 def is_trajectory(dims: tuple[str, ...]) -> bool:
@@ -41,7 +42,7 @@ def _variable_options(layout: StoreLayout, variable: Variable, slots: int) -> di
         "dimension_names": [layout.slot_axis, *variable.dims],
         "attributes": {"long_name": variable.long_name, "units": variable.unit},
         "compressors": [*squeeze, Crc32cCodec()],
-        "chunk_key_encoding": {"name": "default", "separator": "."},
+        "chunk_key_encoding": _KEYS,
         "config": {"write_empty_chunks": True},
     }
 
@@ -67,86 +68,95 @@ def write_template(folder: Path, layout: StoreLayout) -> None:
     Raises:
         OSError: if the disk does not take it.
     """
-    chunks, rows, slot = len(layout.chunk_scenarios), layout.rows, layout.slot_axis
+    chunks = len(layout.chunk_scenarios)
     facts = {"format": FORMAT, "name": layout.name, "title": layout.title, "study_hash": layout.study_hash}
     given = {k: v if isinstance(v, (str, float)) else json.dumps(v) for k, v in layout.provenance.items()}
     root = zarr.create_group(str(folder), attributes={**given, **facts, "identity": layout.identity})
-
-    def texts(name: str, long_name: str, shape: tuple[int, ...], axes: list[str]) -> None:
+    for name, long_name, axes in (
+        ("manifest", "what this store holds, as JSON", []),
+        (COMMITS, "record of each stored chunk, as JSON", ["chunk"]),
+    ):
         root.create_array(
             name,
-            shape=shape,
-            chunks=(1,) * len(shape),
+            shape=(chunks,) * len(axes),
+            chunks=(1,) * len(axes),
             dtype=_TEXT,
             dimension_names=axes,
             attributes={"long_name": long_name},
             compressors=[Crc32cCodec()],
-            chunk_key_encoding={"name": "default", "separator": "."},
+            chunk_key_encoding=_KEYS,
         )
-
-    def fixed(name: str, values: Any, dims: tuple[str, ...], attributes: dict[str, Any]) -> None:
-        values = _plain(values)
-        root.create_array(
-            name,
-            data=values,
-            chunks=tuple(max(size, 1) for size in values.shape),
-            dimension_names=dims,
-            attributes=attributes,
-            compressors=[ZstdCodec(level=3), Crc32cCodec()],
-            chunk_key_encoding={"name": "default", "separator": "."},
-            config={"write_empty_chunks": True},
-        )
-
-    texts("manifest", "what this store holds, as JSON", (), [])
-    texts(COMMITS, "record of each stored chunk, as JSON", (chunks,), ["chunk"])
-    labels = layout.names or np.arange(len(layout.scenario_hashes))
-    fixed(rows, on_slots(layout, labels, "" if layout.names else -1), (slot,), {"long_name": f"the {rows}"})
-    hashes = on_slots(layout, layout.scenario_hashes, "")
-    fixed(f"{rows}_hash", hashes, (slot,), {"long_name": f"SHA-256 of the inputs of the {rows}"})
-    for column in layout.columns:
-        values = _plain(column.values)
-        empty = {"f": np.nan, "b": False}.get(values.dtype.kind, 0 if values.dtype.kind in "iu" else "")
-        fixed(column.key, on_slots(layout, values, empty), (slot,), _attributes(column.label, column.unit))
-    for name, (values, unit, long_name) in layout.coords.items():
-        fixed(name, values, (name.removesuffix("_unit"),), _attributes(long_name, unit))
-    shared = layout.shared()
-    axes = {str(name): axis for array in shared.values() for name, axis in array.coords.items()}
-    for name, array in {**shared, **axes}.items():
-        fixed(name, array.values, tuple(map(str, array.dims)), array.attrs)
+    coords, shared = _write_fixed(root, layout)
     for variable in layout.variables:
         root.create_array(variable.name, **_variable_options(layout, variable, chunks * layout.chunk_size))
     with warnings.catch_warnings():  # that other readers may not know of it, which then read the arrays' own
         warnings.filterwarnings("ignore", "Consolidated metadata", UserWarning)
         zarr.consolidate_metadata(str(folder), zarr_format=3)  # where `xarray.open_zarr` looks
-
-    files, checksums = {}, {}
-    for path in sorted(p for p in folder.rglob("*") if p.is_file()):
-        name = path.relative_to(folder).as_posix()
-        with open(path, "rb") as file:
-            content = file.read()
-            os.fsync(file.fileno())
-        files[name] = len(content)
-        if path.name == "zarr.json":
-            checksums[name] = google_crc32c.value(content)
+    sizes, checksums = _flushed(folder)
     body = {
         **facts,
         "identity": layout.identity,
         "chunk_size": layout.chunk_size,
         "chunk_counts": [len(c) for c in layout.chunk_scenarios],
         "contents": layout.contents,
-        "rows": rows,
+        "rows": layout.rows,
         "columns": [column.key for column in layout.columns],
         "variables": [variable.name for variable in layout.variables],
-        "coords": [*layout.coords, *axes],
-        "shared": list(shared),
-        "files": files,
+        "coords": coords,
+        "shared": shared,
+        "files": sizes,
         "checksums": checksums,
     }
     write_atomically(folder / MANIFEST, text_content(body))
 
 
-def _attributes(long_name: str, unit: str) -> dict[str, str]:
-    return {"long_name": long_name, **({"units": unit} if unit else {})}
+def _write_fixed(root: zarr.Group, layout: StoreLayout) -> tuple[list[str], list[str]]:
+    """Write what belongs to no chunk; returns the names of the axes and of the shared variables."""
+
+    def write(name: str, values: Any, dims: tuple[str, ...], attributes: dict[str, Any]) -> None:
+        values = _plain(values)
+        root.create_array(
+            name,
+            data=values,
+            chunks=tuple(max(size, 1) for size in values.shape),
+            dimension_names=dims,
+            attributes={key: value for key, value in attributes.items() if value},
+            compressors=[ZstdCodec(level=3), Crc32cCodec()],
+            chunk_key_encoding=_KEYS,
+            config={"write_empty_chunks": True},
+        )
+
+    rows, slot = layout.rows, (layout.slot_axis,)
+    labels = layout.names or np.arange(len(layout.scenario_hashes))
+    write(rows, on_slots(layout, labels, "" if layout.names else -1), slot, {"long_name": f"the {rows}"})
+    hashes = on_slots(layout, layout.scenario_hashes, "")
+    write(f"{rows}_hash", hashes, slot, {"long_name": f"SHA-256 of the inputs of the {rows}"})
+    for column in layout.columns:
+        values = _plain(column.values)
+        empty = {"f": np.nan, "b": False}.get(values.dtype.kind, 0 if values.dtype.kind in "iu" else "")
+        about = {"long_name": column.label, "units": column.unit}
+        write(column.key, on_slots(layout, values, empty), slot, about)
+    for name, (values, unit, long_name) in layout.coords.items():
+        write(name, values, (name.removesuffix("_unit"),), {"long_name": long_name, "units": unit})
+    shared = layout.shared()
+    axes = {str(name): axis for array in shared.values() for name, axis in array.coords.items()}
+    for name, array in {**shared, **axes}.items():
+        write(name, array.values, tuple(map(str, array.dims)), array.attrs)
+    return [*layout.coords, *axes], list(shared)
+
+
+def _flushed(folder: Path) -> tuple[dict[str, int], dict[str, int]]:
+    """Bring all files to the disk; their sizes, and the CRC-32C of those that do not end in it."""
+    sizes, checksums = {}, {}
+    for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+        name = path.relative_to(folder).as_posix()
+        with open(path, "rb") as file:
+            content = file.read()
+            os.fsync(file.fileno())
+        sizes[name] = len(content)
+        if path.name == "zarr.json":
+            checksums[name] = google_crc32c.value(content)
+    return sizes, checksums
 
 
 class ChunkEncoder:
