@@ -26,10 +26,9 @@ if not _os.environ.get("JAXMPC_NO_JIT_CACHE"):
 _watch()
 
 _HOME_OF = {
-    "ContinuousController": "controller.continuous",
+    "Controller": "controller.controller",
+    "Controllers": "controller.controller",
     "InputError": "errors",
-    "MixedIntegerController": "controller.mixed_integer",
-    "MixedIntegerControllers": "controller.mixed_integer",
     "Reference": "loop.reference",
     "SensorFault": "controller.measurement",
     "SteadyMap": "steady.map",
@@ -38,7 +37,6 @@ _HOME_OF = {
     "TargetController": "controller.targets",
     "Trajectory": "loop.trajectory",
     "WellPlant": "process.plant",
-    "controller_batch": "controller.batch",
     "fault_errors": "controller.measurement",
     "load_controller": "controller.checkpoint",
     "make_model": "model.step_response",

@@ -1,13 +1,11 @@
 """What type checkers and editors see of the package, whose names are loaded when first used."""
 
-from jaxmpc.controller.batch import controller_batch as controller_batch
 from jaxmpc.controller.checkpoint import load_controller as load_controller
 from jaxmpc.controller.checkpoint import save_controller as save_controller
-from jaxmpc.controller.continuous import ContinuousController as ContinuousController
+from jaxmpc.controller.controller import Controller as Controller
+from jaxmpc.controller.controller import Controllers as Controllers
 from jaxmpc.controller.measurement import SensorFault as SensorFault
 from jaxmpc.controller.measurement import fault_errors as fault_errors
-from jaxmpc.controller.mixed_integer import MixedIntegerController as MixedIntegerController
-from jaxmpc.controller.mixed_integer import MixedIntegerControllers as MixedIntegerControllers
 from jaxmpc.controller.plan import solve_plan as solve_plan
 from jaxmpc.controller.targets import TargetController as TargetController
 from jaxmpc.errors import InputError as InputError

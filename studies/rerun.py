@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from jaxmpc.controller.continuous import ContinuousController
-from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
 from jaxmpc.files import from_strict_json, write_atomically
 from jaxmpc.loop.simulate import simulate
@@ -101,9 +100,8 @@ def rerun(store: Path, number: int) -> Rerun:
             f"scenario {number} was stored by other code or inputs; it may differ now", stacklevel=2
         )
     model = identify_models([scenario.model_point])[scenario.model_point]
-    kind = MixedIntegerController if scenario.kind == "mixed-integer" else ContinuousController
     trajectory = simulate(
-        kind(scenario.structure, scenario.tuning, model),
+        Controller(scenario.structure, scenario.tuning, model),
         WellPlant(parameters=scenario.plant, actuator=scenario.actuator),
         scenario.reference,
         samples=scenario.samples,

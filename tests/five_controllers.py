@@ -4,9 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from jaxmpc.controller.continuous import ContinuousController
-from jaxmpc.controller.mixed_integer import MixedIntegerController
-from jaxmpc.controller.schedule import ScheduledController, ScheduledMixedIntegerController, make_schedule
+from jaxmpc.controller.controller import Controller
+from jaxmpc.controller.schedule import ScheduledController, make_schedule
 from jaxmpc.controller.targets import TargetController
 from jaxmpc.problem.tuning import make_tuning
 
@@ -47,11 +46,10 @@ def controller_of(kind, model, structure, fields, **more):
         corners = [(choke, lift) for choke in (0.0, 100.0) for lift in (0.0, 10000.0)]
         named = [dict(zip(model.mv_names, corner, strict=True)) for corner in corners]
         models = [dataclasses.replace(model, working_point=tuple(point.items())) for point in named]
-        scheduled = ScheduledMixedIntegerController if "integer" in kind else ScheduledController
-        return scheduled(structure, tuning, make_schedule(models))
+        return ScheduledController(structure, tuning, make_schedule(models))
     if kind == "target":
         return TargetController(structure, tuning, model, {"choke": 1.0})
-    return (MixedIntegerController if "integer" in kind else ContinuousController)(structure, tuning, model)
+    return Controller(structure, tuning, model)
 
 
 def stepped(controller, state, cv, setpoint=SETPOINT, mv=None, manual=None):

@@ -11,7 +11,7 @@ def filter_bias(
     raw_before: Float[Array, " cv"],
     raw: Float[Array, " cv"],
     cutoff: Float[Array, ""],
-    dt: float,
+    dt: Float[Array, ""] | float,
 ) -> Float[Array, " cv"]:
     """One sample of the low-pass filter (6.4), the bilinear (Tustin) form of wc / (s + wc).
 

@@ -18,13 +18,14 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from jaxmpc.check import LARGEST, sound
 from jaxmpc.decoding import decode
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
 from jaxmpc.model.step_response import StepResponseModel, make_model
-from jaxmpc.problem.condense import DRIFT
 from jaxmpc.problem.declared import declared
-from jaxmpc.problem.structure import LARGEST, Structure, sound
+from jaxmpc.problem.instance import DRIFT
+from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.problem.tuning import Tuning, make_tuning
 from jaxmpc.relaxed.gap import check_gap, check_time_limit

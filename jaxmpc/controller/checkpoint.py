@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.controller.continuous import ContinuousController, ControllerState
-from jaxmpc.controller.mixed_integer import MixedIntegerController
-from jaxmpc.controller.schedule import ModelSchedule, ScheduledController, ScheduledMixedIntegerController
+from jaxmpc.controller.controller import Controller
+from jaxmpc.controller.core import ControllerState
+from jaxmpc.controller.schedule import ModelSchedule, ScheduledController
 from jaxmpc.controller.targets import TargetController
 from jaxmpc.errors import InputError
 from jaxmpc.files import from_strict_json, strict_json, write_atomically
@@ -25,15 +25,9 @@ from jaxmpc.model.step_response import StepResponseModel, make_model
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import CV_FIELDS, Tuning, make_tuning
 
-FORMAT = "jaxmpc/controller/1"
+FORMAT = "jaxmpc/controller/2"
 
-Controller = (
-    ContinuousController
-    | MixedIntegerController
-    | ScheduledController
-    | ScheduledMixedIntegerController
-    | TargetController
-)
+AnyController = Controller | TargetController
 
 
 class _Parts(NamedTuple):
@@ -46,7 +40,9 @@ class _Parts(NamedTuple):
     options: dict[str, Any]
 
 
-def save_controller(controller: Controller, path: str | Path, state: ControllerState | None = None) -> Path:
+def save_controller(
+    controller: AnyController, path: str | Path, state: ControllerState | None = None
+) -> Path:
     """Write a controller, and the state that it is in, as one file.
 
     Args:
@@ -73,7 +69,7 @@ def save_controller(controller: Controller, path: str | Path, state: ControllerS
     return write_atomically(path, json.dumps(body, allow_nan=False))
 
 
-def load_controller(path: str | Path) -> tuple[Controller, ControllerState | None]:
+def load_controller(path: str | Path) -> tuple[AnyController, ControllerState | None]:
     """Read what `save_controller` wrote.
 
     Args:
@@ -105,7 +101,7 @@ def load_controller(path: str | Path) -> tuple[Controller, ControllerState | Non
         raise InputError("controller file", str(path), f"what save_controller writes ({error})") from error
 
 
-def _parts(controller: Controller) -> _Parts:
+def _parts(controller: AnyController) -> _Parts:
     if isinstance(controller, TargetController):
         inner = _parts(controller.controller)
         cvs = controller.structure.cv_count
@@ -118,18 +114,12 @@ def _parts(controller: Controller) -> _Parts:
         return _Parts(
             "target", controller.structure, dataclasses.replace(inner.tuning, **own), model, options
         )
+    options = {key: getattr(controller, key) for key in ("gap", "time_limit", "finish")}
     structure, tuning = controller.structure, controller.tuning
     if isinstance(controller, ScheduledController):
-        return _Parts("scheduled", structure, tuning, controller.schedule, {})
-    if isinstance(controller, ContinuousController):
-        model = _model(structure, controller.memory.coefficients)
-        options = {"summed": controller.qp.summed is not None, "switching": controller.switching}
-        return _Parts("continuous", structure, tuning, model, options)
-    options = {key: getattr(controller, key) for key in ("gap", "time_limit", "finish")}
-    if isinstance(controller, ScheduledMixedIntegerController):
-        table = {"spacing": controller.together.spacing, "kept": controller.together.kept}
-        return _Parts("scheduled-mixed-integer", structure, tuning, controller.schedule, options | table)
-    return _Parts("mixed-integer", structure, tuning, controller.model, options)
+        table = {"spacing": controller.spacing, "kept": controller.kept}
+        return _Parts("scheduled", structure, tuning, controller.schedule, options | table)
+    return _Parts("controller", structure, tuning, controller.model, options)
 
 
 def _model(structure: Structure, coefficients: Any) -> StepResponseModel:
@@ -137,16 +127,10 @@ def _model(structure: Structure, coefficients: Any) -> StepResponseModel:
     return make_model(coefficients, s.dt, s.cv_names, s.mv_names, cv_units=s.cv_units, mv_units=s.mv_units)
 
 
-KINDS = {
-    "continuous": ContinuousController,
-    "mixed-integer": MixedIntegerController,
-    "scheduled": ScheduledController,
-    "scheduled-mixed-integer": ScheduledMixedIntegerController,
-    "target": TargetController,
-}
+KINDS = {"controller": Controller, "scheduled": ScheduledController, "target": TargetController}
 
 
-def _made(body: dict[str, Any]) -> Controller:
+def _made(body: dict[str, Any]) -> AnyController:
     if body["kind"] not in KINDS:
         raise InputError("controller.kind", body["kind"], f"one of {', '.join(KINDS)}")
     tuples: dict[str, Any] = {
@@ -155,12 +139,12 @@ def _made(body: dict[str, Any]) -> Controller:
     structure = Structure(**tuples)
     fields = {key: _numbers(f"controller.tuning.{key}", values) for key, values in body["tuning"].items()}
     tuning = make_tuning(structure, path="controller.tuning", **{k: v.tolist() for k, v in fields.items()})
-    scheduled = body["kind"].startswith("scheduled")
+    scheduled = body["kind"] == "scheduled"
     model = (ModelSchedule if scheduled else StepResponseModel).from_dict(body["model"])
     return KINDS[body["kind"]](structure, tuning, model, **body["options"])  # pyright: ignore[reportArgumentType]
 
 
-def _restored(controller: Controller, saved: Any) -> ControllerState:
+def _restored(controller: AnyController, saved: Any) -> ControllerState:
     """The state with these numbers, in the form that the controller makes it."""
     if not isinstance(saved, dict):
         raise InputError("controller.state", type(saved).__name__, "an object with the fields of the state")
@@ -177,6 +161,8 @@ def _restored(controller: Controller, saved: Any) -> ControllerState:
     leaves = []
     for key, leaf in wanted.items():
         value = _numbers(f"controller.state.{key}", saved[key])
+        if not value.size and not np.size(leaf):
+            value = value.reshape(np.shape(leaf))  # lists do not show all lengths of an empty array
         if value.shape != np.shape(leaf):
             shapes = f"shape {list(value.shape)}", f"shape {list(np.shape(leaf))}"
             raise InputError(f"controller.state.{key}", *shapes)

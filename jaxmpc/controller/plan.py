@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import time
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -17,22 +17,30 @@ from numpy.typing import ArrayLike
 
 from jaxmpc import html
 from jaxmpc import status as codes
+from jaxmpc.check import LARGEST, check_vector, sound
+from jaxmpc.controller.controller import Controllers, one_lane
+from jaxmpc.controller.core import Core
 from jaxmpc.controller.sample import require_double_precision
 from jaxmpc.errors import InputError
-from jaxmpc.integer.constants import Constants
+from jaxmpc.integer.finish import finish_steps
 from jaxmpc.integer.host_search import SearchResult
-from jaxmpc.integer.relaxer import Relaxations, Relaxer, relaxations
-from jaxmpc.integer.solve import FINISHES, continuous_feasible
-from jaxmpc.integer.step_solver import StepSolver
-from jaxmpc.model.step_response import StepResponseModel, check_match
-from jaxmpc.problem.blocking import first_position_rows, moves_per_block, sample_moves
-from jaxmpc.problem.condense import DRIFT, QpInstance, dynamic_matrix, make_instance
-from jaxmpc.problem.structure import LARGEST, Structure, check_vector, sound
+from jaxmpc.integer.relaxer import Relaxations
+from jaxmpc.integer.search import Decision, decide
+from jaxmpc.integer.solve import FINISHES, UNINTERRUPTED, continuous_feasible
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.problem.blocking import moves_per_block, sample_moves
+from jaxmpc.problem.condense import dynamic_matrix
+from jaxmpc.problem.instance import DRIFT, QpInstance, make_instance
+from jaxmpc.problem.layout import Size
+from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
-from jaxmpc.programs.packing import Packing, flattened, rebuilt
+from jaxmpc.programs.clock import Clock
+from jaxmpc.programs.compilation import compiling_for
+from jaxmpc.programs.lanes import Lanes
+from jaxmpc.programs.packing import Packing, rebuilt
 from jaxmpc.relaxed.gap import check_gap, check_time_limit, closes, relative_gap
 from jaxmpc.relaxed.newton import WarmStart
-from jaxmpc.relaxed.solve import relax
+from jaxmpc.relaxed.solve import cold_start
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,32 +81,41 @@ class Plan:
         return html.plan(self)
 
 
-@functools.partial(jax.jit, static_argnames=("structure", "recover"))
-def _make_instance(structure, tuning, qp, free_response, setpoint, mv_now, last_move, past_moves, recover):
-    """The problem of one sample, with a scenario axis of one."""
+class Posed(NamedTuple):
+    """A step that is posed and decided as far as a compiled program decides it; all arrays with a lane axis."""
+
+    instance: QpInstance
+    decision: Decision
+
+
+def _plan(core: Core, given, settings) -> Posed:
+    free_response, setpoint, mv_now, last_move, past_moves, start = given
     instance = make_instance(
-        structure,
-        tuning,
-        qp,
+        core.layout,
+        core.size,
+        core.tuning,
+        core.qp,
         free_response=free_response,
         setpoint=setpoint,
         mv_now=mv_now,
         last_move=last_move,
         past_moves=past_moves,
-        recover=recover,
+        recover=settings[2] > 0,
     )
-    return jax.tree.map(lambda leaf: leaf[None], instance)
+    tables = eqx.tree_at(lambda t: t.known, core.tables, core.tables.known & (settings[1] > 0))
+    return Posed(instance, decide(core.qp, tables, instance, start, settings[0]))
 
 
-@functools.partial(jax.jit, static_argnames=("structure", "recover", "form", "packings"))
-def _relax_instance(structure, leaves, given, recover, form, packings):
-    """`_make_instance` and its relaxation; goes in and comes out packed."""
-    tuning, qp, rows, columns = rebuilt(form, leaves)
-    *sample, start = jax.tree.map(lambda leaf: leaf[0], packings[0].unpack(given))
-    instances = _make_instance(structure, tuning, qp, *sample, recover)
-    own = jax.tree.map(lambda leaf: leaf[0], instances)
-    root = relax(qp, rows, columns, own, own.lower, own.upper, start)
-    return packings[1].pack((instances, jax.tree.map(lambda leaf: leaf[None], root)))
+@jax.jit
+def _posed(cores: Lanes[Core], given, settings) -> Posed:
+    return jax.vmap(lambda given, settings: _plan(cores.shared, given, settings))(given, settings)
+
+
+@functools.partial(jax.jit, static_argnames=("form", "packing"))
+def _solve(leaves, packed, form, packing: Packing):
+    """A step; goes in and comes out packed."""
+    out = _posed(rebuilt(form, leaves), *packing.unpack(packed))
+    return Packing.of(out).pack(out)
 
 
 class Planner:
@@ -111,18 +128,21 @@ class Planner:
     """
 
     def __init__(self, structure: Structure, tuning: Tuning, model: StepResponseModel):
-        check_match(structure, model)
         self.structure, self.tuning, self.model = structure, tuning, model
+        self.controllers = Controllers(structure, tuning, model)
         self._numbers = jax.tree.map(np.asarray, tuning)
-        self.solver = StepSolver(structure, [tuning], [model])  # refuses what is too large
-        self.matrix = np.asarray(dynamic_matrix(structure, model.coefficients))
-        self._packings: dict[tuple[bool, Packing], Packing] = {}
-        self._started = False
-        self._flat: Any = None
+        core, size = self.controllers.cores.shared, self.controllers.size
+        whole = np.asarray(_matrix(core.layout, core.coefficients, np.arange(1, size.future + 1)))
+        self.matrix = whole[:, : structure.prediction_horizon, :, : structure.block_count]
+        zeros = lambda *shape: np.zeros((1, *shape))  # noqa: E731
+        self._blank = zeros(size.future, size.cvs), zeros(size.mvs), zeros(size.past, size.mvs)
+        instance = jax.eval_shape(_posed_shapes, core, self._blank)
+        self._cold = jax.tree.map(lambda v: np.zeros((1, *v.shape)), instance)
+        self._packings: tuple[Packing, Packing] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """What a copy needs; forms of trees do not survive a copy."""
-        return self.__dict__ | {"_packings": {}, "_flat": None}
+        return self.__dict__ | {"_packings": None}
 
     def solve(
         self,
@@ -152,7 +172,7 @@ class Planner:
             warm: `Plan.warm` of a neighbouring step; ignored where its size does not fit.
             time_limit: seconds, None for none.
             gap: relative gap.
-            finish: one of `integer.FINISHES`.
+            finish: one of `integer.solve.FINISHES`.
         """
         if finish not in FINISHES:
             raise InputError("finish", finish, f"one of {', '.join(FINISHES)}")
@@ -160,115 +180,108 @@ class Planner:
         gap, time_limit = check_gap("gap", gap), check_time_limit("time_limit", time_limit)
         as_array = lambda v: np.asarray(v, dtype=np.float64)  # noqa: E731
         free_response, setpoint, mv_now = as_array(free_response), as_array(setpoint), as_array(mv_now)
-        past = None if past_moves is None else as_array(past_moves)
-        sample = free_response, setpoint, mv_now, as_array(last_move), past
-        relaxer, root = self.solver.relaxer(1), None
-
-        def instances_of(relaxer: Relaxer) -> QpInstance:
-            if root is not None:
-                return instances
-            return _make_instance(self.structure, self.tuning, relaxer.scenario(0).qp, *sample, recover)
-
-        start = None if warm is None else jax.tree.map(lambda leaf: np.asarray(leaf)[None], warm)
-        if self.solver.narrow:
-            begin, instances, root = self._posed(relaxer, sample, recover, relaxer.fitting(start, 1))
-        else:
-            if not self._started:  # compiles; the clock measures solves
-                jax.block_until_ready(instances_of(relaxer))
-                self._started = True
-            begin = time.perf_counter() - self.solver.compiling
-        if root is None or self.structure.integer_mvs:
-            previous = None if previous_moves is None else as_array(previous_moves)[None]
-            relaxer, instances, results, _ = self.solver.solve(
-                instances_of,
-                root=root,
-                previous_moves=previous,
-                warm=start,
-                gap=gap,
-                time_limit=time_limit,
-                finish=finish,
-            )
-            result = results[0]
-        else:
-            result = self._solve_relaxed(relaxer, instances, root, gap)
-        instance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], instances)
-        return self._plan(relaxer.scenario(0), instance, result, mv_now, free_response, setpoint, gap, begin)
-
-    def _posed(
-        self, relaxer: Relaxer, sample: tuple, recover: bool, start: WarmStart
-    ) -> tuple[float, QpInstance, Relaxations]:
-        """When the clock started, the problem for moves of one step, and its relaxation."""
-        given = (*(None if v is None else v[None] for v in sample), start)
-        of_given = Packing.of(given)
-        qp = relaxer.scenario(0).qp
-        if self._flat is None:
-            self._flat = flattened((self.tuning, qp, relaxer.hard, relaxer.columns))
-        leaves, form = self._flat
-        fresh = (recover, of_given) not in self._packings
-        if fresh:
-            shapes = jax.eval_shape(lambda: _make_instance(self.structure, self.tuning, qp, *sample, recover))
-            self._packings[recover, of_given] = Packing.of((shapes, relaxer.solved_shapes))
-        packings = of_given, self._packings[recover, of_given]
-        call = lambda: np.asarray(  # noqa: E731
-            _relax_instance(self.structure, leaves, of_given.pack(given), recover, form, packings)
+        past: np.ndarray = self._blank[2].copy()
+        if past_moves is not None:
+            moves = as_array(past_moves)[-past.shape[1] :]
+            past[0, past.shape[1] - len(moves) :] = moves
+        fits = lambda a, b: np.shape(a) == np.shape(b)[1:]  # noqa: E731
+        start = self._cold
+        if warm is not None and jax.tree.all(jax.tree.map(fits, warm, start)):
+            start = jax.tree.map(lambda leaf: np.asarray(leaf)[None], warm)
+        whole = self.controllers.over_horizon
+        given = (
+            *(whole(free_response[None]), whole(setpoint[None])),
+            *(mv_now[None], as_array(last_move)[None], past, start),
         )
-        if fresh:
-            call()  # compiles; the clock measures solves
-        begin = time.perf_counter() - self.solver.compiling
-        instances, root = packings[1].unpack(call())
-        return begin, instances, relaxations(root, relaxer.predictions)
+        unhurried = time_limit is None or time_limit >= UNINTERRUPTED
+        settings = np.array([[gap, float(finish == "auto" and unhurried), float(recover)]])
+        clock = Clock()
+        posed = self._call((given, settings))
+        result = self._decided(posed, previous_moves, gap, time_limit, finish, clock.seconds)
+        return self._plan(posed, result, mv_now, free_response, setpoint, gap, clock)
 
-    def _solve_relaxed(
-        self, relaxer: Relaxer, instances: QpInstance, root: Relaxations, gap: float
+    def _call(self, given: tuple) -> Posed:
+        leaves, form = self.controllers.flat
+        with compiling_for(str(self.controllers.size)):
+            if self._packings is None:
+                shapes = jax.eval_shape(_posed, self.controllers.cores, *given)
+                self._packings = Packing.of(given), Packing.of(shapes)
+            into, out = self._packings
+            return out.unpack(np.asarray(_solve(leaves, into.pack(given), form, into)))
+
+    def _decided(
+        self, posed: Posed, previous_moves, gap, time_limit, finish: str, spent: float
     ) -> SearchResult:
+        """How the step ended, by the compiled program or on the host."""
+        found = one_lane(posed.decision)
+        if not self.structure.integer_mvs:
+            return self._relaxed(posed, gap)
+        start = found.root.warm
+        if found.closed and finish == "auto":
+            by = codes.FINISHERS[int(found.finished_by)]
+            x, value, bound = found.x, float(found.value), float(found.bound)
+            return SearchResult(x, value, bound, codes.OPTIMAL, by, int(found.nodes), start, spent)
+        previous = np.zeros((1, self.controllers.size.blocks, self.controllers.size.mvs))
+        if previous_moves is not None:
+            previous[0, : self.structure.block_count] = previous_moves
+        results, _ = finish_steps(
+            self.controllers.relaxer,
+            posed.instance,
+            Relaxations.of(posed.decision.root),
+            previous_moves=previous,
+            gap=gap,
+            time_limit=time_limit,
+            finish=finish,
+            spent=spent,
+        )
+        return results[0]
+
+    def _relaxed(self, posed: Posed, gap: float) -> SearchResult:
         """The problem without integers: one relaxation."""
-        if not continuous_feasible(self.structure, jax.tree.map(lambda leaf: np.asarray(leaf)[0], instances)):
+        instance, root = one_lane(posed.instance), one_lane(posed.decision.root)
+        if not continuous_feasible(self.structure, self.controllers.size, instance):
             return SearchResult(None, np.inf, np.inf, codes.INFEASIBLE, None, 0)
-        if not np.isfinite(root.x[0]).all():
+        if not np.isfinite(root.warm.x).all():
             return SearchResult(None, np.inf, -np.inf, codes.FAILED, None, 1)
-        value = float(root.objective[0])
-        bound = min(max(float(root.bound[0]), 0.0), value)
-        closed = closes(value, bound, relaxer.scenario(0).scale, gap)
+        value = float(root.objective)
+        bound = min(max(float(root.bound), 0.0), value)
+        closed = closes(value, bound, self._unit, gap)
         status, by = (codes.OPTIMAL, "relaxation") if closed else (codes.LIMIT, None)
-        return SearchResult(root.x[0], value, bound, status, by, 1, root.start(0))
+        return SearchResult(root.warm.x, value, bound, status, by, 1, root.warm)
+
+    @functools.cached_property
+    def _unit(self) -> float:
+        """Of the objective, see `gap.closes`."""
+        return float(self.controllers.cores.shared.tables.scale)
 
     def _plan(
-        self,
-        constants: Constants,
-        instance,
-        result: SearchResult,
-        mv_now,
-        free_response,
-        setpoint,
-        gap,
-        begin,
+        self, posed: Posed, result: SearchResult, mv_now, free_response, setpoint, gap, clock: Clock
     ) -> Plan:
-        elapsed = lambda: time.perf_counter() - begin - self.solver.compiling  # noqa: E731
         if result.x is None:
-            name = codes.STATUS[result.status]
-            return Plan(name, None, None, None, None, None, None, None, None, result.nodes, elapsed(), None)
+            name, took = codes.STATUS[result.status], clock.seconds
+            return Plan(name, None, None, None, None, None, None, None, None, result.nodes, took, None)
+        core, size = self.controllers.cores.shared, self.controllers.size
         x = np.array(result.x)
-        integer = constants.integer
-        x[integer] = np.round(x[integer])
-        x = _repair(self.structure, instance, x)
-        moves = (x * np.asarray(constants.qp.scale)).reshape(self.structure.mv_count, -1).T
+        x = np.where(np.asarray(core.qp.whole), np.round(x), x)
+        x = _repair(self.structure, size, one_lane(posed.instance), x)
+        moves = (x * np.asarray(core.qp.scale)).reshape(size.mvs, -1).T[: self.structure.block_count]
         objective, cv, eps = self.objective(moves, free_response, setpoint)
         bound = min(result.bound, objective)
         state = result.status
-        if state == codes.OPTIMAL and not closes(objective, bound, constants.scale, gap):
+        if state == codes.OPTIMAL and not closes(objective, bound, self._unit, gap):
             state = codes.LIMIT
         return Plan(
             status=codes.STATUS[state],
             objective=objective,
             bound=bound,
-            gap=float(relative_gap(objective, bound, constants.scale)),
+            gap=float(relative_gap(objective, bound, self._unit)),
             moves=moves,
             mv=mv_now + np.cumsum(sample_moves(self.structure) @ moves, axis=0),
             cv=cv,
             eps_high=eps[0],
             eps_low=eps[1],
             nodes=result.nodes,
-            solve_time_s=elapsed(),
+            solve_time_s=clock.seconds,
             finished_by=result.finished_by if state == codes.OPTIMAL else None,
             warm=result.root,
         )
@@ -303,22 +316,40 @@ class Planner:
         return float(value), cv, (eps_high, eps_low)
 
 
-def _repair(structure: Structure, instance: QpInstance, x: np.ndarray) -> np.ndarray:
+def _repair(structure: Structure, size: Size, instance: QpInstance, x: np.ndarray) -> np.ndarray:
     """Take solver tolerance out of the continuous moves: clip moves, then positions, block after block."""
-    x = x.copy()
-    lower, upper = np.asarray(instance.lower), np.asarray(instance.upper)
-    row_low, row_high = np.asarray(instance.row_low), np.asarray(instance.row_high)
-    counts, blocks = moves_per_block(structure), structure.block_count
-    for mv, row in enumerate(first_position_rows(structure)):
-        columns = slice(mv * blocks, (mv + 1) * blocks)
-        if mv not in structure.integer_mvs:
-            position, own = 0.0, x[columns]
-            for b in range(blocks):
-                low = max(lower[columns][b], (row_low[row + b] - position) / counts[b])
-                high = min(upper[columns][b], (row_high[row + b] - position) / counts[b])
-                own[b] = min(max(own[b], low), high) if low <= high else own[b]
-                position += counts[b] * own[b]
+    by_mv = lambda values: np.reshape(values, (size.mvs, -1))  # noqa: E731
+    lower, upper = by_mv(instance.lower), by_mv(instance.upper)
+    row_low, row_high = by_mv(instance.row_low), by_mv(instance.row_high)
+    x, counts = x.copy(), moves_per_block(structure)
+    for mv in sorted(set(range(size.mvs)) - set(structure.integer_mvs)):
+        position, own = 0.0, by_mv(x)[mv]
+        for b in range(structure.block_count):
+            low = max(lower[mv, b], (row_low[mv, b] - position) / counts[b])
+            high = min(upper[mv, b], (row_high[mv, b] - position) / counts[b])
+            own[b] = min(max(own[b], low), high) if low <= high else own[b]
+            position += counts[b] * own[b]
     return x
+
+
+_matrix = jax.jit(dynamic_matrix)
+
+
+def _posed_shapes(core: Core, blank) -> WarmStart:
+    """A start of a core's problems."""
+    response, mv, past = (v[0] for v in blank)
+    instance = make_instance(
+        core.layout,
+        core.size,
+        core.tuning,
+        core.qp,
+        free_response=response,
+        setpoint=response,
+        mv_now=mv,
+        last_move=mv,
+        past_moves=past,
+    )
+    return cold_start(core.qp, instance)
 
 
 def solve_plan(

@@ -4,7 +4,7 @@ The choke of a gas-lifted well does several times more near closed than at half 
 that were identified at several positions; every sample, the controllers here predict their future moves with the model of
 the present MVs.
 
-A change of model is bumpless. What past moves will still do stays in the shift register of `controller.Memory` as it was
+A change of model is bumpless. What past moves will still do stays in the shift register as it was
 predicted when they were made; only the response of moves from now on changes. What the prediction then misses is
 output bias, as ever (2.31).
 
@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import collections
 import json
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,15 +27,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxmpc.controller.continuous import ContinuousController, ControllerState, StepInfo
-from jaxmpc.controller.mixed_integer import MixedIntegerController, MixedIntegerControllers
+from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.core import ControllerState, Core, Moment, StepInfo
 from jaxmpc.controller.sample import Sample
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
 from jaxmpc.model.step_response import StepResponseModel, advance_free_response, make_model
-from jaxmpc.problem.condense import condense
+from jaxmpc.problem.condense import condense, matrices_of
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
+from jaxmpc.programs.clock import Clock
+from jaxmpc.programs.lanes import Lanes
 
 FORMAT = "jaxmpc/gain-schedule/1"
 SPACING = 250.0  # of continuous MVs in the table of mixed-integer controllers [MV unit]
@@ -195,142 +196,111 @@ def _cell(grid: Float[Array, " point"], value):
     return i, i + 1, jnp.clip((value - grid[i]) / (grid[i + 1] - grid[i]), 0.0, 1.0)
 
 
+def _register(schedule: ModelSchedule, mv, samples: int) -> Float[Array, "cv mv future"]:
+    """Coefficients at the MVs, as long as a shift register."""
+    model = eqx.tree_at(lambda m: m.coefficients, schedule.reference, schedule.coefficients_at(mv))
+    return model.extended(samples)
+
+
 def _half_way(schedule: ModelSchedule, used: Float[Array, "cv mv future"], future, before, move):
     """The shift register with the effect of a move by the model half-way along it, not by the one that planned it."""
-    model = eqx.tree_at(
-        lambda m: m.coefficients, schedule.reference, schedule.coefficients_at(before + 0.5 * move)
-    )
-    return advance_free_response(future, model.extended(used.shape[-1]) - used, move)
+    there = _register(schedule, before + 0.5 * move, used.shape[-1])
+    return advance_free_response(future, there - used, move)
 
 
 _corrected = jax.jit(_half_way)
 _coefficients_at: Any = jax.jit(ModelSchedule.coefficients_at)
 
 
-class ScheduledController(ContinuousController):
-    """MPC with continuous moves and the model of the present MVs; pure, so that it can be jitted, vmapped, scanned.
-
-    The condensed problem is built from the interpolated coefficients inside the step.
-
-    Args:
-        structure: static configuration without integer MVs.
-        tuning: weights and limits; batch its fields to batch controllers (`batch.build_lanes`).
-        schedule: of step-response models.
-    """
+class ScheduledCore(Core):
+    """A core whose problems are built from the interpolated coefficients inside the step."""
 
     schedule: ModelSchedule
 
-    def __init__(self, structure: Structure, tuning: Tuning, schedule: ModelSchedule):
-        super().__init__(structure, tuning, schedule.reference)
-        self.schedule = schedule
+    def consider(self, state: ControllerState, sample: Sample, gap, search=True) -> Moment:
+        """Observe, pose and decide a sample with the model of the present MVs."""
+        standing = self.locate(state, sample.mv, sample.manual).mv
+        coefficients = _register(self.schedule, standing, self.size.future)
+        matrices = matrices_of(self.layout, self.size, coefficients, summed=False)
+        levels, limits = self.qp.steep.shape[0], self.qp.has_limits
+        qp = condense(self.layout, self.size, self.tuning, matrices, envelope=levels, has_limits=limits)
+        scale = jnp.maximum(jnp.max(jnp.diagonal(qp.curvature)), 1e-12)
+        tables = eqx.tree_at(lambda t: t.scale, self.tables, scale)
+        now = Core(self.layout, self.tuning, coefficients, qp, tables, self.size, self.switching)
+        return now.consider(state, sample, gap, search)
 
-    def decide(self, state: ControllerState, sample: Sample) -> tuple[ControllerState, StepInfo]:
-        """`step` of a checked sample, to be traced."""
-        s = self.structure
-        standing = self.memory.locate(state, sample.mv, sample.manual).mv
-        model = eqx.tree_at(
-            lambda m: m.coefficients, self.schedule.reference, self.schedule.coefficients_at(standing)
-        )
-        now = eqx.tree_at(
-            lambda c: (c.memory.coefficients, c.qp),
-            self,
-            (
-                model.extended(max(s.prediction_horizon, model.samples)),
-                condense(s, self.tuning, model.coefficients, envelope=0, summed=False),
-            ),
-        )
-        state, info = ContinuousController.decide(now, state, sample)
-        future = _half_way(self.schedule, now.memory.coefficients, state.future, standing, info.move)
-        return eqx.tree_at(lambda s: s.future, state, future), info
+    def moving(self, before: Float[Array, " mv"], move: Float[Array, " mv"]) -> Float[Array, "cv mv future"]:
+        """Coefficients half-way along a move."""
+        return _register(self.schedule, before + 0.5 * move, self.size.future)
 
 
-class ScheduledMixedIntegerControllers(MixedIntegerControllers):
-    """The batch of one that `ScheduledMixedIntegerController` steps: a table of controllers over the present MVs.
+class _Table:
+    """Controllers with whole moves over the present MVs, made when first needed; steps like `Controllers` of one lane.
 
     Args:
-        structure: static configuration with at least one integer MV.
-        tuning: weights and limits.
+        controllers: with the schedule's reference model.
         schedule: of step-response models.
         spacing: of the table in continuous MVs [MV unit]; integer MVs have one row per step.
         kept: controllers kept; the one used least recently goes first.
-        **options: ``gap``, ``time_limit`` and ``finish`` of `MixedIntegerControllers`.
     """
 
-    def __init__(
-        self,
-        structure: Structure,
-        tuning: Tuning,
-        schedule: ModelSchedule,
-        *,
-        spacing: float = SPACING,
-        kept: int = KEPT,
-        **options: Any,
-    ):
+    def __init__(self, controllers: Controllers, schedule: ModelSchedule, spacing: float, kept: int):
         if not (np.isfinite(spacing) and spacing > 0):
             raise InputError("spacing", spacing, "a positive distance of models in the table [MV unit]")
         if isinstance(kept, bool) or not isinstance(kept, int) or kept < 1:
             raise InputError("kept", kept, "a whole number of controllers, 1 or more")
-        super().__init__(structure, [tuning], [schedule.reference], **options)
-        self.tuning, self.schedule, self.options = tuning, schedule, options
-        self.spacing, self.kept = spacing, kept
-        self.grid = np.array([step or spacing for step in structure.integer_step])
+        self.reference, self.schedule, self.spacing, self.kept = controllers, schedule, spacing, kept
+        self.size, self.init, self.structure = controllers.size, controllers.init, controllers.structure
+        self.grid = np.array([step or spacing for step in self.structure.integer_step])
         self.built = 0  # controllers made so far
-        self._table: collections.OrderedDict[tuple[float, ...], MixedIntegerControllers] = (
-            collections.OrderedDict()
-        )
+        self._table: collections.OrderedDict[tuple[float, ...], Controllers] = collections.OrderedDict()
 
-    def at(self, mv) -> MixedIntegerControllers:
-        """The controller for the MVs [MV unit], rounded to the table; made when first needed."""
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the table, which is made again when needed."""
+        return self.__dict__ | {"_table": collections.OrderedDict()}
+
+    def at(self, mv) -> Controllers:
+        """The controller for the MVs [MV unit], rounded to the table."""
         point = tuple((np.round(np.asarray(mv) / self.grid) * self.grid).tolist())
         if point not in self._table:
-            model = self.schedule.model_at(point)
-            self._table[point] = MixedIntegerControllers(
-                self.structure, [self.tuning], [model], **self.options
-            )
+            own, model = self.reference, self.schedule.model_at(point)
+            options: dict[str, Any] = dict(gap=own.gap, time_limit=own.time_limit, finish=own.finish)
+            self._table[point] = Controllers(self.structure, own.scenarios.tunings, model, **options)
             self.built += 1
             if len(self._table) > self.kept:
                 self._table.popitem(last=False)
         self._table.move_to_end(point)
         return self._table[point]
 
-    def prepare(self, state: ControllerState, cv: Float[np.ndarray, "scenario cv"]) -> None:
-        """Compile what nearly every sample needs; arguments as in `step`."""
-        controllers = self.at(state.mv[0])
-        controllers.prepare(state, cv)
-        used = controllers.memory.lane(0).coefficients
-        _corrected(self.schedule, used, state.future[0], state.mv[0], state.last_move[0])
-
     def decide(self, state: ControllerState, sample: Sample) -> tuple[ControllerState, StepInfo]:
-        """`step` of a checked sample. Its time includes the making of a controller."""
-        begin = time.perf_counter()
+        """One sample. Its time includes the making of a controller."""
+        clock = Clock()
         before = np.where(np.isfinite(sample.mv[0]), sample.mv[0], np.asarray(state.mv)[0])
         controllers = self.at(before)
-        made = time.perf_counter() - begin
+        made = clock.seconds
         state, info = controllers.decide(state, sample)
-        begin = time.perf_counter()
+        clock = Clock()
         # moves of the others are too small to matter
         if np.any(info.move[0, list(self.structure.integer_mvs)]):
-            used = controllers.memory.lane(0).coefficients
+            used = controllers.cores.shared.coefficients
             future = _corrected(self.schedule, used, state.future[0], before, info.move[0])
             state = eqx.tree_at(lambda s: s.future, state, np.asarray(future)[None])
-        made += time.perf_counter() - begin
-        return state, eqx.tree_at(lambda i: i.solve_time, info, info.solve_time + made)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """What a copy needs; the table is filled again."""
-        return super().__getstate__() | {"_table": collections.OrderedDict()}
+        return state, eqx.tree_at(lambda i: i.solve_time, info, info.solve_time + made + clock.seconds)
 
 
-class ScheduledMixedIntegerController(MixedIntegerController):
-    """MPC with whole moves of the integer MVs and the model of the present MVs; runs on the host, solves exactly.
+class ScheduledController(Controller):
+    """MPC with the model of the present MVs.
+
+    Without integer MVs the problem is built from the interpolated coefficients inside the step, which is pure; with them, a
+    table of controllers over the present MVs is kept.
 
     Args:
-        structure: static configuration with at least one integer MV.
+        structure: static configuration.
         tuning: weights and limits.
         schedule: of step-response models.
         spacing: of the table in continuous MVs [MV unit].
-        kept: controllers kept.
-        **options: ``gap``, ``time_limit`` and ``finish`` of `MixedIntegerController`.
+        kept: controllers kept in the table.
+        **options: ``gap``, ``time_limit`` and ``finish`` of `Controller`.
     """
 
     def __init__(
@@ -344,7 +314,22 @@ class ScheduledMixedIntegerController(MixedIntegerController):
         **options: Any,
     ):
         super().__init__(structure, tuning, schedule.reference, **options)
-        self.schedule = schedule
-        self.together = ScheduledMixedIntegerControllers(
-            structure, tuning, schedule, spacing=spacing, kept=kept, **options
-        )
+        self.schedule, self.spacing, self.kept = schedule, spacing, kept
+        if structure.integer_mvs:
+            self.lanes: Any = _Table(self.lanes, schedule, spacing, kept)
+            return
+        core = self.lanes.cores.shared
+        given = (core.layout, core.tuning, core.coefficients, core.qp, core.tables, core.size, core.switching)
+        scheduled = ScheduledCore(*given, schedule)
+        self.lanes.cores = Lanes(jax.tree.map(lambda _: None, scheduled), scheduled)
+
+    @property
+    def compiled(self) -> bool:
+        """Whether its steps may be part of a compiled loop."""
+        return not self.structure.integer_mvs
+
+    @property
+    def core(self) -> Core:
+        """What compiled programs know of the controller; of the reference model where there is a table."""
+        lanes = self.lanes.reference if self.structure.integer_mvs else self.lanes
+        return lanes.cores.shared

@@ -3,33 +3,27 @@
 J_new = J + sum over j = 1..Hp of weight * (u(k+j-1) - u_target)^2, with u held after the control horizon. An MV with a
 target gets a CV of its own: its step response is 1 from the next sample on, its measurement the present demand, its
 setpoint the target. Prediction, condensing, relaxations, whole moves, batches and certificates then need not know of
-targets at all, and the answer is exact. `TargetController` hides the further CVs; `simulate_with_targets` closes the loop.
+targets at all, and the answer is exact. `TargetController` hides the further CVs; `loop.targets` closes the loop.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import ArrayLike, Bool, Float
 
-from jaxmpc.controller.continuous import ContinuousController, ControllerState, StepInfo
-from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.controller.controller import Controller
+from jaxmpc.controller.core import ControllerState, StepInfo
 from jaxmpc.controller.sample import checked, checked_start
 from jaxmpc.errors import InputError
-from jaxmpc.loop.reference import Reference
-from jaxmpc.loop.simulate import simulate
-from jaxmpc.loop.trajectory import AXES, Trajectory
-from jaxmpc.model.step_response import StepResponseModel, check_match
-from jaxmpc.problem.structure import Structure
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.problem.structure import Structure, check_match
 from jaxmpc.problem.tuning import CV_FIELDS, DEFAULTS, Tuning
-from jaxmpc.process.plant import WellPlant
-from jaxmpc.process.well.host import HostWell
 
 SUFFIX = ".target"
 
@@ -102,27 +96,23 @@ def _units(cv_units: tuple[str, ...], cvs: int, mv_units: tuple[str, ...], mvs: 
     return (cv_units or ("",) * cvs) + tuple(mv_units[i] if mv_units else "" for i in mvs)
 
 
-class TargetController(eqx.Module):
+class TargetController:
     """A controller that also steers some MVs to targets; `step` takes them beside the setpoints.
 
-    With continuous moves `step` is pure JAX and can be jitted, vmapped and scanned; with an integer MV it runs on the host.
+    Without integer MVs `step` is pure, as that of `Controller`.
 
     Args:
         structure: static configuration, integer MVs or none.
         tuning: weights and limits.
         model: step-response model.
         target_weight: by MV name [1/MV unit^2]; see `augment`.
-        **options: of `MixedIntegerController` or `ContinuousController`.
+        **options: of `Controller`.
 
     Attributes:
         structure: as given, without the further CVs.
         controller: the controller of the augmented problem.
         targeted: MVs with a target, positions in MV order.
     """
-
-    structure: Structure = eqx.field(static=True)
-    controller: Any
-    targeted: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -132,13 +122,12 @@ class TargetController(eqx.Module):
         target_weight: Mapping[str, float],
         **options: Any,
     ):
-        kind = MixedIntegerController if structure.integer_mvs else ContinuousController
         self.structure = structure
-        self.controller: Any = kind(*augment(structure, tuning, model, target_weight), **options)
+        self.controller = Controller(*augment(structure, tuning, model, target_weight), **options)
         self.targeted = tuple(i for i, name in enumerate(structure.mv_names) if name in target_weight)
 
     def init(self, cv: Float[ArrayLike, " cv"], mv: Float[ArrayLike, " mv"]) -> ControllerState:
-        """State at a steady state; arguments and errors as in `ContinuousController.init`."""
+        """State at a steady state; arguments and errors as in `Controller.init`."""
         cv, mv = checked_start(self.structure, cv, mv)
         return self.controller.init(self._with(cv, mv), mv)
 
@@ -158,13 +147,12 @@ class TargetController(eqx.Module):
             cv: measurement now, without the further CVs [CV unit].
             setpoint: at j = 1..Hp, or held over the horizon [CV unit].
             mv_target: held over the horizon [MV unit]; entries of MVs without a target are not looked at.
-            mv, manual: as in `ContinuousController.step`.
+            mv, manual: as in `Controller.step`.
         """
         given = checked(self.structure, cv, setpoint, mv, manual)
         self._check_targets(mv_target)
-        stands = (jnp if isinstance(self.controller, ContinuousController) else np).where(
-            given.mv == given.mv, given.mv, state.position
-        )
+        xp = _module(given.cv, given.mv, state.position)
+        stands = xp.where(given.mv == given.mv, given.mv, state.position)
         wide = self._with(given.cv, stands), self._with(given.setpoint, mv_target)
         return self.controller.step(state, *wide, given.mv, given.manual)
 
@@ -179,99 +167,13 @@ class TargetController(eqx.Module):
             raise InputError("mv_target", mv_target, expected)
 
     def _with(self, cv, mv):
-        """Values of the CVs, over a horizon or not, then those of the MVs with a target; where the controller is."""
-        xp: Any = jnp if isinstance(self.controller, ContinuousController) else np
-        own = xp.asarray(mv)[xp.asarray(self.targeted, dtype=int)]
+        """Values of the CVs, over a horizon or not, then those of the MVs with a target; on the host if these are."""
+        xp = _module(cv, mv)
+        own = xp.asarray(mv)[np.asarray(self.targeted, dtype=int)]
         return xp.concatenate(
             [xp.asarray(cv), xp.broadcast_to(own, (*cv.shape[:-1], len(self.targeted)))], axis=-1
         )
 
 
-def simulate_with_targets(
-    controller: TargetController,
-    plant: Any,
-    reference: Reference,
-    mv_target: Reference,
-    *,
-    noise=None,
-    faults=None,
-    position_feedback: bool = False,
-    **options: Any,
-) -> Trajectory:
-    """Close the loop with setpoints for the CVs and targets for the MVs.
-
-    Args:
-        controller: with the targets' weights.
-        plant: as in `jaxmpc.simulate`.
-        reference: setpoints, one column per CV.
-        mv_target: targets over time, one column per MV; columns of MVs without a target are not looked at.
-        noise: standard deviation of the measurement noise, ``"cv"`` [CV unit]; demands are known without noise.
-        faults, position_feedback: as in `jaxmpc.simulate`, for the plant's own CVs.
-        **options: of `jaxmpc.simulate`.
-
-    Returns:
-        `Trajectory` of the plant's own CVs; `setpoint` has those of `reference`. Its objective is J + J_u (6.20).
-
-    Raises:
-        InputError: as `jaxmpc.simulate`, and if the targets have not one column per MV.
-    """
-    own, targeted = controller.structure, controller.targeted
-    if mv_target.cv_count != own.mv_count:
-        names = ", ".join(own.mv_names)
-        raise InputError(
-            "mv_target", f"{mv_target.cv_count} columns", f"{own.mv_count} columns, one per MV ({names})"
-        )
-    if noise is not None:
-        given = np.asarray(noise, dtype=np.float64)
-        if given.shape != (own.cv_count,):
-            raise InputError(
-                "noise", np.asarray(noise).tolist(), f"{own.cv_count} standard deviations, one per CV"
-            )
-        noise = np.append(given, np.zeros(len(targeted)))
-    if faults is not None:
-        faults = np.asarray(faults, dtype=np.float64)
-        if faults.ndim != 2 or faults.shape[1] != own.cv_count:
-            raise InputError("faults", f"shape {list(faults.shape)}", f"[sample, {own.cv_count}] errors")
-        faults = np.pad(faults, ((0, 0), (0, len(targeted))))
-    both = _joined(reference, mv_target, own.dt, targeted)
-    reporting = _Reporting(plant, targeted, position_feedback)
-    given = dict(noise=noise, faults=faults, position_feedback=position_feedback)
-    wide = simulate(controller.controller, reporting, both, **given, **options)
-    count = own.cv_count
-    fields = {key: getattr(wide, key)[:, :count] for key in AXES["cv"]}
-    return dataclasses.replace(wide, **fields, cv_names=own.cv_names, cv_units=own.cv_units)
-
-
-def _joined(reference: Reference, mv_target: Reference, dt: float, targeted: tuple[int, ...]) -> Reference:
-    """Setpoints and targets in one reference, which changes where either does."""
-    duration = min(reference.duration, mv_target.duration)
-    times = sorted({0.0, *reference.times.tolist(), *mv_target.times.tolist()})
-    times = np.array([t for t in times if t < duration])
-    held = lambda r: r.setpoints[np.searchsorted(r.times, times, side="right") - 1]  # noqa: E731
-    return Reference(
-        times, np.concatenate([held(reference), held(mv_target)[:, list(targeted)]], axis=1), duration
-    )
-
-
-class _Outputs(NamedTuple):
-    cv: np.ndarray
-    mv: np.ndarray
-
-
-class _Reporting:
-    """A plant on the host that also measures the MVs with a target: their demands, or their positions if these are told."""
-
-    def __init__(self, plant: Any, targeted: tuple[int, ...], told: bool):
-        self.plant = HostWell(plant) if isinstance(plant, WellPlant) else plant
-        self.targeted, self.told, self.dt = list(targeted), told, plant.dt
-
-    def init(self) -> _Outputs:
-        outputs = self.plant.init()
-        return self._report(outputs, outputs.mv)
-
-    def step(self, mv, disturbance: float = 0.0) -> _Outputs:
-        return self._report(self.plant.step(mv, disturbance), mv)
-
-    def _report(self, outputs, demand) -> _Outputs:
-        known = np.asarray(outputs.mv if self.told else demand)[self.targeted]
-        return _Outputs(np.append(np.asarray(outputs.cv), known), np.asarray(outputs.mv))
+def _module(*values: Any) -> Any:
+    return jnp if any(isinstance(value, Tracer) for value in values) else np

@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxmpc.integer.constants import Constants
 from jaxmpc.integer.relaxer import Relaxations
+from jaxmpc.integer.tables import Constants
 
 
 def cut_of(constants: Constants, result: Relaxations, lane: int, lower, upper):
@@ -30,14 +30,12 @@ def cut_of(constants: Constants, result: Relaxations, lane: int, lower, upper):
     """
     c = constants
     at = result.x[lane, c.integer]
-    gradient = result.gradient[lane, c.integer].copy()
+    gradient = result.gradient[lane, c.integer]
     # undo the box of the integers that the bound minimised over, and the linearised own weight
     value = result.bound[lane] - np.minimum(gradient * (lower - at), gradient * (upper - at)).sum()
-    if c.levels:
-        price = result.envelope[lane].reshape(c.levels, -1)
-        knot = c.knot.reshape(c.levels, -1)
-        value -= (price * at - knot * np.abs(price)).sum()
-        gradient -= price.sum(axis=0)
+    price = result.envelope[lane][:, c.integer]
+    value -= (price * at - c.knot * np.abs(price)).sum()
+    gradient = gradient - price.sum(axis=0)
     return float(value), at, gradient
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from jaxmpc.problem.blocking import moves_per_block, oscillation_rows, window_rows
+from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure
 
 NEAR = (3, 30)  # steps around the wanted moves in which the nearest are looked for first
@@ -47,36 +48,29 @@ class Chain:
     window_high: np.ndarray
 
 
-def chains_of(structure: Structure, row_low: np.ndarray, row_high: np.ndarray) -> list[Chain]:
-    """Chains of all integer MVs from the limits of `blocking.hard_rows`."""
-    blocks, counts = structure.block_count, moves_per_block(structure)
+def chains_of(structure: Structure, size: Size, row_low: np.ndarray, row_high: np.ndarray) -> list[Chain]:
+    """Chains of all integer MVs from the limits of the hard rows (`condense.Rows`)."""
+    blocks, windows = structure.block_count, window_rows(structure)
+    low, high = (np.reshape(values, (size.mvs, size.rows)) for values in (row_low, row_high))
+    pair, window = (
+        slice(size.blocks, size.blocks + blocks),
+        slice(2 * size.blocks, 2 * size.blocks + len(windows)),
+    )
     pairs = oscillation_rows(structure)
-    to_block = np.argmax(pairs, axis=1) if len(pairs) else np.zeros(0, dtype=int)
-    windows = window_rows(structure)
-    chains, row = [], 0
-    for mv in range(structure.mv_count):
-        low, high = row_low[row : row + blocks], row_high[row : row + blocks]
-        row += blocks
-        if mv in structure.integer_mvs:
-            coupled = np.zeros(blocks, dtype=bool)
-            coupled[to_block] = np.isfinite(row_high[row : row + len(pairs)])
-            row += len(pairs)
-            ahead = slice(row, row + len(windows))
-            columns = len(chains) * blocks + np.arange(blocks)
-            chains.append(
-                Chain(
-                    columns,
-                    counts,
-                    whole(low),
-                    whole(high),
-                    coupled,
-                    windows,
-                    row_low[ahead],
-                    row_high[ahead],
-                )
-            )
-        row += len(windows)
-    return chains
+    has_pair = np.isin(np.arange(blocks), np.argmax(pairs, axis=1) if len(pairs) else [])
+    return [
+        Chain(
+            columns=k * blocks + np.arange(blocks),
+            counts=moves_per_block(structure),
+            low=whole(low[mv, :blocks]),
+            high=whole(high[mv, :blocks]),
+            coupled=has_pair & np.isfinite(high[mv, pair]),
+            windows=windows,
+            window_low=low[mv, window],
+            window_high=high[mv, window],
+        )
+        for k, mv in enumerate(structure.integer_mvs)
+    ]
 
 
 def whole(steps: np.ndarray) -> Int[np.ndarray, "..."]:

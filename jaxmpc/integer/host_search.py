@@ -13,11 +13,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxmpc.integer.constants import Constants
 from jaxmpc.integer.feasible import Chain, chains_of, nearest, satisfied, whole
 from jaxmpc.integer.lower_bound import LowerModel
 from jaxmpc.integer.relaxer import Relaxations
-from jaxmpc.problem.condense import QpInstance
+from jaxmpc.integer.tables import Constants
+from jaxmpc.problem.instance import QpInstance
 from jaxmpc.relaxed.gap import FINEST, closes, cutoff, reference
 from jaxmpc.relaxed.newton import WarmStart
 from jaxmpc.status import FAILED, INFEASIBLE, LIMIT, OPTIMAL
@@ -81,7 +81,7 @@ class Search:
         self.gap = max(gap, FINEST)
         self.limits = np.asarray(instance.lower), np.asarray(instance.upper)
         self.chains: list[Chain] = chains_of(
-            constants.structure, np.asarray(instance.row_low), np.asarray(instance.row_high)
+            constants.structure, constants.size, np.asarray(instance.row_low), np.asarray(instance.row_high)
         )
         self.root, self.start = root, root.start(0)
         self.root_bound = max(float(root.bound[0]), 0.0)  # every term of (6.6) is non-negative
@@ -161,12 +161,9 @@ class Search:
         values = lower[:, None] + np.arange(width)[None, :]
         least = np.minimum(slope * (lower - center), slope * (upper - center))
         excess = slope[:, None] * (values - center[:, None]) - least[:, None]
-        if c.levels:
-            price = result.envelope[lane].reshape(c.levels, -1)
-            knot, steep = c.knot.reshape(c.levels, -1), c.slope.reshape(c.levels, -1)
-            for m in range(c.levels):
-                own = steep[m][:, None] * np.maximum(np.abs(values) - knot[m][:, None], 0.0)
-                excess += own - price[m][:, None] * values + (knot[m] * np.abs(price[m]))[:, None]
+        for steep, knot, price in zip(c.slope, c.knot, result.envelope[lane][:, c.integer], strict=True):
+            own = steep[:, None] * np.maximum(np.abs(values) - knot, 0.0)
+            excess += own - price[:, None] * values + (knot * np.abs(price))[:, None]
         excess = np.where(values <= upper[:, None], np.maximum(excess, 0.0), np.inf)
         value = float(result.bound[lane])
         return LowerModel(value, center, lower, upper, excess, c.schur, c.radius, c.order, c.leading)

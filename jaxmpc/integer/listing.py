@@ -6,105 +6,20 @@ are of one step at most. `compiled_search` solves the best of a list; `levelset`
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxmpc.integer.constants import Constants
-from jaxmpc.integer.lower_bound import assignment_order
-from jaxmpc.problem.blocking import first_position_rows, moves_per_block, oscillation_rows
-from jaxmpc.problem.condense import QpInstance, integer_columns
-from jaxmpc.problem.structure import Structure
+from jaxmpc.integer.tables import Tables
+from jaxmpc.problem.instance import QpInstance
 
 LONGEST = 4096  # moves on a list; longer lists are left to the host
 GRID_FREE = 5  # free moves up to which all combinations are looked at
 BLOCK = 32  # entries of a list that are extended together
 STEPS = np.array([0.0, 1.0, -1.0])  # of one move; their codes are 0, 1, 3
-
-
-class Tables(eqx.Module):
-    """Constants of a scenario that the search reads, integer moves in the order in which they are assigned.
-
-    Attributes:
-        radius, leading: as in `levelset.LowerModel`.
-        root: factor of the curvature, `levelset.root_factor`.
-        slope, knot: of the envelope of every move.
-        own_weight: see `cuts`.
-        scale: see `gap.closes`.
-    """
-
-    radius: Float[np.ndarray, " integer"]
-    leading: Float[np.ndarray, "integer integer"]
-    root: Float[np.ndarray, "integer integer"]
-    slope: Float[np.ndarray, "level integer"]
-    knot: Float[np.ndarray, "level integer"]
-    own_weight: Float[np.ndarray, " integer"]
-    scale: Float[np.ndarray, ""]
-
-    @classmethod
-    def of(cls, constants: Constants) -> Tables:
-        """Those of one scenario."""
-        c, order = constants, constants.order
-
-        def levels(values):
-            return values.reshape(c.levels, -1)[:, order] if c.levels else np.zeros((0, len(order)))
-
-        return cls(
-            radius=c.radius[order],
-            leading=c.leading,
-            root=c.root_factor[order],
-            slope=levels(c.slope),
-            knot=levels(c.knot),
-            own_weight=c.own_weight[order],
-            scale=np.asarray(c.scale),
-        )
-
-
-class Order(NamedTuple):
-    """Integer moves in the order in which they are assigned, from the structure alone.
-
-    Attributes:
-        order: their places among the integer moves.
-        columns: their places in x.
-        reach: ``"integer integer"``, row i gives the position of its MV after move i.
-        previous: row i picks the move before i of the same MV.
-        position: hard row of that position.
-        pair: hard row that couples the move to the one before it; -1 for none.
-    """
-
-    order: np.ndarray
-    columns: np.ndarray
-    reach: np.ndarray
-    previous: np.ndarray
-    position: np.ndarray
-    pair: np.ndarray
-
-
-@functools.lru_cache(maxsize=64)
-def order_of(structure: Structure) -> Order:
-    """That of a structure."""
-    mvs, blocks, counts = structure.integer_mvs, structure.block_count, moves_per_block(structure)
-    order = assignment_order(blocks, len(mvs))
-    chain, block = order // blocks, order % blocks
-    mine = chain[:, None] == chain[None, :]
-    earlier = block[None, :] <= block[:, None]
-    firsts = first_position_rows(structure)[np.asarray(mvs)]
-    pairs = oscillation_rows(structure)
-    row_of = np.full(blocks, -1)
-    row_of[np.argmax(pairs, axis=1)] = np.arange(len(pairs))
-    return Order(
-        order=order,
-        columns=integer_columns(structure)[order],
-        reach=(mine & earlier) * counts[block][None, :].astype(float),
-        previous=(mine & (block[None, :] == block[:, None] - 1)).astype(float),
-        position=firsts[chain] + block,
-        pair=np.where(row_of[block] < 0, -1, firsts[chain] + blocks + row_of[block]),
-    )
 
 
 class LowerBound(NamedTuple):
@@ -123,20 +38,21 @@ class PositionLimits(NamedTuple):
     coupled: Array
 
 
-def position_limits(order: Order, instance: QpInstance) -> PositionLimits:
+def position_limits(tables: Tables, instance: QpInstance) -> PositionLimits:
     """Those of one sample."""
+    used = jnp.arange(tables.column.shape[0]) < tables.count
     return PositionLimits(
-        low=jnp.round(instance.row_low[order.position]),
-        high=jnp.round(instance.row_high[order.position]),
-        coupled=jnp.isfinite(instance.row_high[order.pair]) & (order.pair >= 0),
+        low=jnp.where(used, jnp.round(instance.row_low[tables.position]), -jnp.inf),
+        high=jnp.where(used, jnp.round(instance.row_high[tables.position]), jnp.inf),
+        coupled=jnp.asarray(tables.coupled) & jnp.isfinite(instance.row_high[tables.pair]),
     )
 
 
 def fits(
-    order: Order, limits: PositionLimits, points: Float[Array, "point integer"]
+    tables: Tables, limits: PositionLimits, points: Float[Array, "point integer"]
 ) -> Bool[Array, " point"]:
     """Whether whole moves satisfy the hard rows."""
-    position, before = points @ order.reach.T, points @ order.previous.T
+    position, before = points @ tables.reach.T, points @ tables.previous.T
     good = (position >= limits.low) & (position <= limits.high)
     return jnp.all(good & (~limits.coupled | (jnp.abs(points - before) <= 1.0)), axis=1)
 
@@ -166,9 +82,7 @@ def decode(codes: Int[Array, "*point"], moves: int) -> Float[Array, "*point inte
     return jnp.where(digits == 3, -1, digits).astype(float)
 
 
-def grid_below(
-    order: Order, tables: Tables, limits: PositionLimits, model: LowerBound, sizes, cutoff
-) -> Listed:
+def grid_below(tables: Tables, limits: PositionLimits, model: LowerBound, sizes, cutoff) -> Listed:
     """All combinations of a few free moves."""
     left = jnp.isfinite(model.excess)
     free = sizes > 1
@@ -183,7 +97,7 @@ def grid_below(
     away = (points - model.center) @ tables.leading.T
     bounds = model.value + own + 0.5 * jnp.sum(away**2, axis=1)
     used = np.arange(3**GRID_FREE) < powers[jnp.minimum(jnp.sum(free), GRID_FREE)]
-    bounds = jnp.where(used & fits(order, limits, points) & (bounds < cutoff), bounds, jnp.inf)
+    bounds = jnp.where(used & fits(tables, limits, points) & (bounds < cutoff), bounds, jnp.inf)
     rest = LONGEST - len(points)
     return Listed(
         jnp.pad(encode(points), (0, rest)),
@@ -192,10 +106,10 @@ def grid_below(
     )
 
 
-def list_below(order: Order, tables: Tables, limits: PositionLimits, model: LowerBound, cutoff) -> Listed:
+def list_below(tables: Tables, limits: PositionLimits, model: LowerBound, cutoff) -> Listed:
     """Breadth-first search, move by move; `BLOCK` partial assignments at a time get their next move."""
-    moves, room = len(order.columns), LONGEST + 3 * BLOCK
-    reach, previous, leading = (jnp.asarray(v) for v in (order.reach, order.previous, tables.leading))
+    moves, room = tables.column.shape[0], LONGEST + 3 * BLOCK
+    reach, previous, leading = tables.reach, tables.previous, tables.leading
 
     def assign(carry):
         i, codes, bounds, count = carry
@@ -232,9 +146,11 @@ def list_below(order: Order, tables: Tables, limits: PositionLimits, model: Lowe
 
     codes = jnp.zeros((2, room), dtype=int)
     bounds = jnp.full((2, room), jnp.inf).at[0, 0].set(model.value)
-    _, codes, bounds, count = jax.lax.while_loop(
-        lambda carry: (carry[0] < moves) & (carry[3] <= LONGEST), assign, (0, codes, bounds, jnp.asarray(1))
+    assigned, codes, bounds, count = jax.lax.while_loop(
+        lambda carry: (carry[0] < tables.count) & (carry[3] <= LONGEST),
+        assign,
+        (0, codes, bounds, jnp.asarray(1)),
     )
-    end = moves % 2
+    end = assigned % 2
     there = np.arange(LONGEST) < count
     return Listed(codes[end, :LONGEST], jnp.where(there, bounds[end, :LONGEST], jnp.inf), count)

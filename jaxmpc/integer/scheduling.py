@@ -1,6 +1,6 @@
 """Runs many searches side by side: their relaxations share batched calls, their MILPs run in threads.
 
-`integer` builds the searches. Every round collects what all searches wait for, so that a batch of scenarios costs
+`integer.solve` builds the searches. Every round collects what all searches wait for, so that a batch of scenarios costs
 few compiled calls; a scenario that is done drops out and costs nothing more.
 """
 
@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import concurrent.futures
 import os
-import time
 
 import jax
 import numpy as np
 
 from jaxmpc.integer.host_search import Offload, Request, Search, SearchResult, Steps
 from jaxmpc.integer.relaxer import Relaxer
-from jaxmpc.problem.condense import QpInstance
+from jaxmpc.problem.instance import QpInstance
+from jaxmpc.programs.clock import Clock
 from jaxmpc.programs.interrupts import being_left
 
 
@@ -30,12 +30,12 @@ class _Run:
 
     def send(self, value) -> None:
         """Go on with an answer, up to the next question or the end."""
-        begin = time.perf_counter()
+        clock = Clock()
         try:
             self.waits = self.steps.send(value)
         except StopIteration as end:
             self.waits, self.result = None, end.value
-        self.search.spent += time.perf_counter() - begin
+        self.search.spent += clock.seconds
 
 
 def run(
@@ -84,8 +84,8 @@ def run(
 
 
 def _timed(work):
-    begin = time.perf_counter()
-    return work(), time.perf_counter() - begin
+    clock = Clock()
+    return work(), clock.seconds
 
 
 def _answer(relaxer: Relaxer, instances: QpInstance, asking: list[_Run]) -> None:
@@ -94,7 +94,7 @@ def _answer(relaxer: Relaxer, instances: QpInstance, asking: list[_Run]) -> None
     counts = [len(request.lower) for request in requests]
     index = np.repeat([one.number for one in asking], counts)
     join = lambda *leaves: leaves[0] if len(leaves) == 1 else np.concatenate(leaves)  # noqa: E731
-    begin, compiled = time.perf_counter(), relaxer.compiling
+    clock = Clock()
     result = relaxer.solve(
         instances,
         index,
@@ -102,7 +102,7 @@ def _answer(relaxer: Relaxer, instances: QpInstance, asking: list[_Run]) -> None
         join(*(request.upper for request in requests)),
         jax.tree.map(join, *(request.starts for request in requests)),
     )
-    per_lane = (time.perf_counter() - begin - (relaxer.compiling - compiled)) / len(index)
+    per_lane = clock.seconds / len(index)
     first = 0
     for one, count in zip(asking, counts, strict=True):
         one.search.spent += per_lane * count

@@ -1,43 +1,78 @@
-"""The search for the whole moves of one step as one compiled program.
+"""The whole moves of one step as one compiled program, from the relaxation on.
 
-It takes the line of `integer` as far as most steps need it: the rounded relaxation is solved for an incumbent, the
-prices of the root leave a list of whole moves that may be better (`levelset`), and the best of the list are solved one
-after the other, each with a quadratic cut that bounds all others (`cuts`), until none is left. What does not fit (moves of
-more than one step, rounded moves that break a hard row, longer lists) is left to `integer`, which starts anew.
+One loop carries what to solve next: first the problem itself, then its rounded moves for an incumbent, then the best of a
+list. The prices of the root leave a list of whole moves that may be better than the incumbent (`lower_bound`,
+`listing`), and the best of the list are solved one after the other, each with a quadratic cut that bounds all others
+(`cuts`), until none is left. What does not fit (moves of more than one step, rounded moves that break a hard row, longer
+lists) is left to `integer.solve`, which goes on from the relaxation.
 """
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxmpc.integer import listing as lists
-from jaxmpc.integer.listing import STEPS, Listed, LowerBound, Order, Tables, decode, encode, fits, order_of
-from jaxmpc.problem.condense import CondensedQp, QpInstance
-from jaxmpc.problem.structure import Structure
+from jaxmpc.integer import listing
+from jaxmpc.integer.listing import STEPS, Listed, LowerBound, decode, encode, fits
+from jaxmpc.integer.tables import Tables
+from jaxmpc.problem.condense import CondensedQp
+from jaxmpc.problem.instance import QpInstance
+from jaxmpc.programs.lanes import one_by_one
 from jaxmpc.relaxed.gap import closes, cutoff
-from jaxmpc.relaxed.solve import Solved, map_singly, relax
-from jaxmpc.status import finisher_code
+from jaxmpc.relaxed.newton import WarmStart, warm_start_of
+from jaxmpc.relaxed.problem import evaluate
+from jaxmpc.relaxed.solve import solve_lane
+from jaxmpc.status import OPTIMAL, finisher_code
 
 MOST_SOLVED = 64  # of a list
 CUT_BLOCK = 256  # entries of a list that are cut together
-MOST_MOVES = 31  # of two bits each in one code
+ROW_ROUNDING = 1e-6  # slack of the hard rows of rounded moves, which are whole numbers themselves
+
+
+class Relaxed(NamedTuple):
+    """What a search reads of one relaxed problem, or of a batch.
+
+    Attributes:
+        warm: its moves and prices.
+        objective, bound, status: as in `QpSolution`.
+        snapped: objective with the integer moves rounded where they are and the others kept; infinite if that breaks
+            a hard row.
+        steps: Newton steps.
+    """
+
+    warm: WarmStart
+    objective: Array
+    bound: Array
+    snapped: Array
+    status: Array
+    steps: Array
+
+
+def relax(qp: CondensedQp, instance: QpInstance, lower, upper, start: WarmStart) -> Relaxed:
+    """Relax one problem within limits of the moves, and evaluate its moves with the integer ones rounded."""
+    s = solve_lane(qp, instance, lower, upper, start)
+    snapped = jnp.where(qp.whole, jnp.round(s.x), s.x)
+    w = qp.rows.of(snapped)
+    fit = jnp.all((w <= instance.row_high + ROW_ROUNDING) & (w >= instance.row_low - ROW_ROUNDING))
+    fit &= jnp.all((snapped <= instance.upper + ROW_ROUNDING) & (snapped >= instance.lower - ROW_ROUNDING))
+    value = jnp.where(fit, evaluate(qp, instance, snapped), jnp.inf)
+    return Relaxed(warm_start_of(s), s.objective, s.bound, value, s.status, s.iterations)
 
 
 class Decision(NamedTuple):
     """What a search found.
 
     Attributes:
-        closed: whether it is proven; nothing else counts otherwise.
+        closed: whether it is proven; nothing else but the root counts otherwise.
         x: the moves, scaled.
         value, bound: objective, and what no whole moves are below.
         finished_by: code of `status.FINISHERS`.
-        nodes: relaxations solved in place of the root and the rounded root.
-        steps: Newton steps and interior-point iterations.
+        nodes: relaxations solved with whole moves, 1 where the root was enough.
+        steps: Newton steps.
+        root: the relaxation.
     """
 
     closed: Bool[Array, ""]
@@ -47,15 +82,14 @@ class Decision(NamedTuple):
     finished_by: Int[Array, ""]
     nodes: Int[Array, ""]
     steps: Int[Array, ""]
-
-
-def searchable(structure: Structure) -> bool:
-    """Whether the search knows all hard rows of a structure, and its codes hold all moves."""
-    moves = len(structure.integer_mvs) * structure.block_count
-    return 0 < moves <= MOST_MOVES and structure.mean_move_mode != "predictive"
+    root: Relaxed
 
 
 class _State(NamedTuple):
+    """Of a search; `point` and the limits are what is solved next, `expected` its bound so far."""
+
+    lower: Array
+    upper: Array
     point: Array
     expected: Array
     codes: Array
@@ -64,111 +98,202 @@ class _State(NamedTuple):
     value: Array
     x: Array
     left_out: Array
-    nodes: Array
+    solved: Array
     steps: Array
     finished_by: Array
     open: Array
     given_up: Array
+    root: Relaxed
 
 
+@one_by_one
 def decide(
-    structure: Structure,
-    qp: CondensedQp,
-    tables: Tables,
-    rows: Float[Array, "hard n"],
-    instance: QpInstance,
-    root: Solved,
-    gap: Float[Array, ""] | float,
+    qp: CondensedQp, tables: Tables, instance: QpInstance, start: WarmStart, gap: Float[Array, ""]
 ) -> Decision:
-    """Search one step (use `jax.vmap` for a batch).
+    """Relax and search one step (use `jax.vmap` for a batch).
 
     Args:
-        structure: `searchable`.
         qp: constant part.
         tables: of the same scenario.
-        rows: hard rows.
         instance: the problem of this sample.
-        root: its relaxation.
+        start: where the relaxation begins.
         gap: relative gap at which a solve is optimal.
     """
-    return _decide(structure)(qp, tables, jnp.asarray(rows), instance, root, jnp.asarray(gap, dtype=float))
+    search = _Search(qp, tables, instance, jnp.asarray(gap, dtype=float))
+
+    def visit(state: _State) -> _State:
+        """Solve what is next, and choose what to solve after it."""
+        result = relax(qp, instance, state.lower, state.upper, state.root.warm)
+        state = state._replace(solved=state.solved + 1, steps=state.steps + result.steps)
+        if not tables.column.shape[0]:
+            return search.begun(state, result)
+        return jax.lax.cond(state.solved == 1, search.begun, search.after, state, result)
+
+    state = jax.lax.while_loop(lambda state: state.open, visit, search.start(start))
+    left_out = jnp.minimum(state.left_out, jnp.min(state.bounds))
+    root_bound = jnp.maximum(state.root.bound, 0.0)
+    bound = jnp.minimum(jnp.maximum(left_out, root_bound), state.value)
+    closed = ~state.given_up & closes(state.value, bound, tables.scale, search.gap)
+    return Decision(
+        closed=closed | search.none & ~state.given_up,
+        x=state.x,
+        value=state.value,
+        bound=bound,
+        finished_by=state.finished_by,
+        nodes=jnp.maximum(state.solved - 1, 1),
+        steps=state.steps,
+        root=state.root,
+    )
 
 
-@functools.lru_cache(maxsize=64)
-def _decide(structure: Structure):
-    """`decide_lane`, whose batches a CPU searches one by one."""
-    lane = functools.partial(decide_lane, structure)
+class _Search(NamedTuple):
+    """The problem of one search."""
 
-    def where_open(*arguments) -> Decision:
-        """A search takes as long to set up as a relaxation: none without a root."""
-        root: Solved = arguments[-2]
-        none, zero = jnp.zeros(()), jnp.zeros((), dtype=int)
-        nothing = Decision(jnp.asarray(False), jnp.zeros_like(root.warm.x), none, none, zero, zero + 1, zero)
-        return jax.lax.cond(jnp.isfinite(root.bound), lambda: lane(*arguments), lambda: nothing)
+    qp: CondensedQp
+    tables: Tables
+    instance: QpInstance
+    gap: Array
 
-    search = jax.custom_batching.custom_vmap(lane)
+    @property
+    def none(self) -> Array:
+        """Whether there is nothing to search for: no integer moves."""
+        return self.tables.count == 0
 
-    @search.def_vmap
-    def _(size: int, batched, *arguments):
-        own = tuple(batched)
-        if jax.default_backend() == "cpu":
-            result = map_singly(where_open, arguments, own)
-        else:
-            axes = jax.tree.map(lambda its: 0 if its else None, own)
-            result = jax.vmap(lane, in_axes=axes, axis_size=size)(*arguments)
-        return result, jax.tree.map(lambda _: True, result)
+    @property
+    def used(self) -> Array:
+        """Integer moves that are no padding."""
+        return jnp.arange(self.tables.column.shape[0]) < self.tables.count
 
-    return search
+    def of(self, values: Float[Array, "*rest n"], absent: float = 0.0):
+        """The entries of the integer moves."""
+        return jnp.where(self.used, values[..., self.tables.column], absent)
 
+    def start(self, warm: WarmStart) -> _State:
+        """Before the relaxation."""
+        number, whole = jnp.zeros(()), jnp.zeros((), dtype=int)
+        infinite, no = jnp.asarray(jnp.inf), jnp.asarray(False)
+        longest = listing.LONGEST if self.tables.column.shape[0] else 0
+        root = Relaxed(warm, number, -infinite, infinite, whole, whole.astype(jnp.int32))
+        return _State(
+            lower=self.instance.lower,
+            upper=self.instance.upper,
+            point=jnp.zeros(self.tables.column.shape[0]),
+            expected=-infinite,
+            codes=jnp.zeros(longest, dtype=int),
+            bounds=jnp.full(max(longest, 1), jnp.inf),
+            count=whole,
+            value=infinite,
+            x=jnp.zeros_like(self.instance.lower),
+            left_out=infinite,
+            solved=whole,
+            steps=whole,
+            finished_by=whole,
+            open=~no,
+            given_up=no,
+            root=root,
+        )
 
-def decide_lane(
-    structure: Structure, qp: CondensedQp, tables: Tables, rows, instance, root: Solved, gap
-) -> Decision:
-    """`decide` for one lane; under `jax.vmap`, all lanes go in lockstep."""
-    order = order_of(structure)
-    columns = order.columns
-    predictions = instance.limit_high.shape[0]
-    low, high = jnp.round(instance.lower[columns]), jnp.round(instance.upper[columns])
-    limits = lists.position_limits(order, instance)
-    usable = jnp.isfinite(root.warm.x).all() & jnp.isfinite(root.bound)
-    usable &= jnp.all((low >= -1.0) & (high <= 1.0) & (low <= high))
-    root_bound = jnp.maximum(root.bound, 0.0)  # every term of (6.6) is non-negative
-    model = _lower_model(order, tables, root, predictions, low, high)
-    first = jnp.clip(jnp.round(model.center), low, high)
-    usable &= fits(order, limits, first[None])[0]
+    @property
+    def limits(self) -> tuple[Array, Array]:
+        """Limits of the integer moves."""
+        return jnp.round(self.of(self.instance.lower)), jnp.round(self.of(self.instance.upper))
 
-    def solved(point) -> Solved:
-        lower, upper = (v.at[columns].set(point) for v in (instance.lower, instance.upper))
-        return relax(qp, rows, columns, instance, lower, upper, root.warm)
+    def begun(self, state: _State, root: Relaxed) -> _State:
+        """The relaxation is known: it may be whole already; if not, its rounded moves come next."""
+        low, high = self.limits
+        bound = jnp.maximum(root.bound, 0.0)  # every term of (6.6) is non-negative
+        value = jnp.where(self.none, root.objective, root.snapped)
+        found = jnp.isfinite(root.warm.x).all() & jnp.isfinite(root.bound)
+        closed = jnp.where(
+            self.none,
+            root.status == OPTIMAL,
+            closes(value, jnp.minimum(bound, value), self.tables.scale, self.gap),
+        )
+        first = jnp.clip(jnp.round(self.of(root.warm.x)), low, high)
+        usable = found & self.tables.known & ~self.none
+        usable &= jnp.all((low >= -1.0) & (high <= 1.0) & (low <= high))
+        limits = listing.position_limits(self.tables, self.instance)
+        usable &= fits(self.tables, limits, first[None])[0]
+        state = state._replace(
+            value=value,
+            x=jnp.where(self.qp.whole, jnp.round(root.warm.x), root.warm.x),
+            finished_by=jnp.where(closed, finisher_code("relaxation"), 0),
+            left_out=jnp.where(closed, bound, jnp.inf),
+            open=usable & ~closed,
+            given_up=~closed & ~usable,
+            root=root,
+        )
+        return self.next(state, first)
 
-    def cut_of(result: Solved, low, high):
+    def next(self, state: _State, point) -> _State:
+        """With these whole moves to be solved next."""
+        put = lambda values: values.at[self.tables.column].set(point, mode="drop")  # noqa: E731
+        lower, upper = put(self.instance.lower), put(self.instance.upper)
+        return state._replace(point=point, lower=lower, upper=upper)
+
+    def after(self, state: _State, result: Relaxed) -> _State:
+        """Whole moves are solved: an incumbent, a cut, and what to solve after them."""
+        better = (result.snapped < state.value) & jnp.isfinite(result.warm.x).all()
+        x = result.warm.x.at[self.tables.column].set(state.point, mode="drop")
+        bound = jnp.maximum(result.bound, state.expected)
+        state = state._replace(
+            value=jnp.where(better, result.snapped, state.value),
+            x=jnp.where(better, x, state.x),
+            left_out=jnp.minimum(state.left_out, jnp.minimum(bound, result.snapped)),
+        )
+        state = jax.lax.cond(state.solved == 2, self.listed, lambda state: state, state)
+        state = self.with_cut(state, self.cut_of(result, state.point, state.point))
+        best = jnp.argmin(state.bounds)
+        limit = cutoff(state.value, self.tables.scale, self.gap)
+        going = (state.bounds[best] < limit) & ~state.given_up
+        too_many = state.solved > MOST_SOLVED
+        state = state._replace(
+            expected=state.bounds[best],
+            bounds=state.bounds.at[best].set(jnp.where(going, jnp.inf, state.bounds[best])),
+            open=going & ~too_many,
+            given_up=state.given_up | (going & too_many),
+        )
+        return self.next(state, jnp.where(going, decode(state.codes[best], len(state.point)), state.point))
+
+    def lower_bound(self, root: Relaxed, low, high) -> LowerBound:
+        """See `host_search.Search.lower_model`."""
+        center, slope = self.of(root.warm.x), -self.of(root.warm.box_price)
+        least = jnp.minimum(slope * (low - center), slope * (high - center))
+        excess = slope[:, None] * (STEPS - center[:, None]) - least[:, None]
+        price, knot = self.of(root.warm.envelope_price)[..., None], self.qp.knot[..., None]
+        own = self.tables.slope[..., None] * jnp.maximum(jnp.abs(STEPS) - knot, 0.0)
+        excess += jnp.sum(own - price * STEPS + knot * jnp.abs(price), axis=0)
+        allowed = (low[:, None] <= STEPS) & (high[:, None] >= STEPS)
+        return LowerBound(root.bound, center, jnp.where(allowed, jnp.maximum(excess, 0.0), jnp.inf))
+
+    def cut_of(self, result: Relaxed, low, high):
         """See `cuts.cut_of`."""
-        at, gradient = result.warm.x[columns], -result.warm.box_price[columns]
+        at, gradient = self.of(result.warm.x), -self.of(result.warm.box_price)
         value = result.bound - jnp.sum(jnp.minimum(gradient * (low - at), gradient * (high - at)))
-        price = _envelope(order, tables, result, predictions)
-        value -= jnp.sum(price * at - tables.knot * jnp.abs(price))
+        price = self.of(result.warm.envelope_price)
+        value -= jnp.sum(price * at - self.qp.knot * jnp.abs(price))
         return value, at, gradient - jnp.sum(price, axis=0)
 
-    def listed(state: _State, result: Solved) -> _State:
+    def listed(self, state: _State) -> _State:
         """The first incumbent is known: what may be better?"""
-        limit = cutoff(state.value, tables.scale, gap)
+        tables, root, (low, high) = self.tables, state.root, self.limits
+        root_bound, limit = jnp.maximum(root.bound, 0.0), cutoff(state.value, tables.scale, self.gap)
+        model = self.lower_bound(root, low, high)
         away = STEPS - model.center[:, None]
         curved = jnp.where(jnp.isfinite(tables.radius), 0.5 / tables.radius, 0.0)[:, None] * away**2
         alone = model.value + model.excess + curved
         excess = jnp.where(alone < limit, model.excess, jnp.inf)
-        left = jnp.isfinite(excess)
-        sizes = jnp.sum(left, axis=1)
+        sizes = jnp.sum(jnp.isfinite(excess), axis=1)
         kept = LowerBound(model.value, model.center, excess)
-        grid = jnp.sum(sizes > 1) <= lists.GRID_FREE
+        grid = jnp.sum(sizes > 1) <= listing.GRID_FREE
         closed, empty = root_bound >= limit, jnp.any(sizes == 0)
-
-        which = jnp.where(closed | empty, 0, jnp.where(grid, 1, 2))
+        limits = listing.position_limits(tables, self.instance)
         found = jax.lax.switch(
-            which,
+            jnp.where(closed | empty, 0, jnp.where(grid, 1, 2)),
             [
                 Listed.empty,
-                lambda: lists.grid_below(order, tables, limits, kept, sizes, limit),
-                lambda: lists.list_below(order, tables, limits, kept, limit),
+                lambda: listing.grid_below(tables, limits, kept, sizes, limit),
+                lambda: listing.list_below(tables, limits, kept, limit),
             ],
         )
         fixed = empty | (jnp.max(sizes) == 1)
@@ -177,102 +302,32 @@ def decide_lane(
             finisher_code("relaxation"),
             jnp.where(fixed, finisher_code("fixing"), finisher_code("enumeration")),
         )
-        bounds = jnp.where(found.codes == encode(state.point), jnp.inf, found.bounds)
         state = state._replace(
             codes=found.codes,
-            bounds=bounds,
-            count=jnp.minimum(found.count, lists.LONGEST),
+            bounds=jnp.where(found.codes == encode(state.point), jnp.inf, found.bounds),
+            count=jnp.minimum(found.count, listing.LONGEST),
             left_out=jnp.minimum(state.left_out, jnp.where(closed, root_bound, limit)),
             finished_by=by,
-            given_up=(found.count > lists.LONGEST) | ~jnp.isfinite(state.value),
+            given_up=(found.count > listing.LONGEST) | ~jnp.isfinite(state.value),
         )
-        return with_cut(state, cut_of(root, low, high))
+        return self.with_cut(state, self.cut_of(root, low, high))
 
-    def with_cut(state: _State, cut) -> _State:
+    def with_cut(self, state: _State, cut) -> _State:
         """Bounds of everything on the list are raised to those of a cut."""
         value, at, gradient = cut
+        tables = self.tables
         sound = jnp.isfinite(value) & jnp.isfinite(gradient).all()
         curved_at = at @ tables.root
 
         def more(carry):
             begin, bounds = carry
-            points = decode(jax.lax.dynamic_slice(state.codes, (begin,), (CUT_BLOCK,)), len(columns))
+            points = decode(jax.lax.dynamic_slice(state.codes, (begin,), (CUT_BLOCK,)), len(at))
             away = points @ tables.root - curved_at
-            bound = (
-                value
-                + (points - at) @ gradient
-                + 0.5 * jnp.sum(away**2, axis=1)
-                + points**2 @ tables.own_weight
-            )
+            own = 0.5 * jnp.sum(away**2, axis=1) + points**2 @ tables.own_weight
+            bound = value + (points - at) @ gradient + own
             old = jax.lax.dynamic_slice(bounds, (begin,), (CUT_BLOCK,))
             new = jnp.where(sound, jnp.maximum(old, bound), old)
             return begin + CUT_BLOCK, jax.lax.dynamic_update_slice(bounds, new, (begin,))
 
         _, bounds = jax.lax.while_loop(lambda carry: carry[0] < state.count, more, (0, state.bounds))
         return state._replace(bounds=bounds)
-
-    def visit(state: _State) -> _State:
-        """Solve the next moves: an incumbent, a cut, and what to solve after them."""
-        result = solved(state.point)
-        better = (result.snapped < state.value) & jnp.isfinite(result.warm.x).all()
-        state = state._replace(
-            value=jnp.where(better, result.snapped, state.value),
-            x=jnp.where(better, result.warm.x.at[columns].set(state.point), state.x),
-            left_out=jnp.minimum(
-                state.left_out, jnp.minimum(jnp.maximum(result.bound, state.expected), result.snapped)
-            ),
-            nodes=state.nodes + 1,
-            steps=state.steps + result.steps,
-        )
-        state = jax.lax.cond(state.nodes == 2, listed, lambda state, _: state, state, result)
-        state = with_cut(state, cut_of(result, state.point, state.point))
-        best = jnp.argmin(state.bounds)
-        going = (state.bounds[best] < cutoff(state.value, tables.scale, gap)) & ~state.given_up
-        return state._replace(
-            point=jnp.where(going, decode(state.codes[best], len(columns)), state.point),
-            expected=state.bounds[best],
-            bounds=state.bounds.at[best].set(jnp.where(going, jnp.inf, state.bounds[best])),
-            open=going & (state.nodes <= MOST_SOLVED),
-            given_up=state.given_up | (going & (state.nodes > MOST_SOLVED)),
-        )
-
-    rounded = root.warm.x.at[columns].set(jnp.round(root.warm.x[columns]))
-    state = _State(
-        point=first,
-        expected=jnp.asarray(-jnp.inf),
-        codes=jnp.zeros(lists.LONGEST, dtype=int),
-        bounds=jnp.full(lists.LONGEST, jnp.inf),
-        count=jnp.zeros((), dtype=int),
-        value=root.snapped,
-        x=rounded,
-        left_out=jnp.asarray(jnp.inf),
-        nodes=jnp.ones((), dtype=int),
-        steps=jnp.zeros((), dtype=int),
-        finished_by=jnp.zeros((), dtype=int),
-        open=usable,
-        given_up=~usable,
-    )
-    state = jax.lax.while_loop(lambda state: state.open, visit, state)
-    left_out = jnp.minimum(state.left_out, jnp.min(state.bounds))
-    bound = jnp.minimum(jnp.maximum(left_out, root_bound), state.value)
-    closed = ~state.given_up & closes(state.value, bound, tables.scale, gap)
-    return Decision(
-        closed, state.x, state.value, bound, state.finished_by, jnp.maximum(state.nodes - 1, 1), state.steps
-    )
-
-
-def _envelope(order: Order, tables: Tables, result: Solved, predictions: int):
-    """Prices of the envelope, ``"level integer"``."""
-    return result.warm.row_price[predictions:].reshape(tables.knot.shape)[:, order.order]
-
-
-def _lower_model(order: Order, tables: Tables, root: Solved, predictions: int, low, high) -> LowerBound:
-    """See `search.Search.lower_model`."""
-    center, slope = root.warm.x[order.columns], -root.warm.box_price[order.columns]
-    least = jnp.minimum(slope * (low - center), slope * (high - center))
-    excess = slope[:, None] * (STEPS - center[:, None]) - least[:, None]
-    price, knot = _envelope(order, tables, root, predictions)[..., None], tables.knot[..., None]
-    own = tables.slope[..., None] * jnp.maximum(jnp.abs(STEPS) - knot, 0.0)
-    excess += jnp.sum(own - price * STEPS + knot * jnp.abs(price), axis=0)
-    allowed = (low[:, None] <= STEPS) & (high[:, None] >= STEPS)
-    return LowerBound(root.bound, center, jnp.where(allowed, jnp.maximum(excess, 0.0), jnp.inf))

@@ -10,14 +10,12 @@ incumbent, lower bound, gap. `plan` and the mixed-integer controllers call this 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 
 import jax
 import numpy as np
 
 from jaxmpc.integer.branch_and_bound import branch_and_bound
-from jaxmpc.integer.constants import Constants
 from jaxmpc.integer.cuts import Cuts
 from jaxmpc.integer.enumeration import enumerate_all
 from jaxmpc.integer.feasible import UndecidedError, propagate, satisfied, whole
@@ -26,12 +24,12 @@ from jaxmpc.integer.lower_bound import LowerModel, enumerate_below, exclude
 from jaxmpc.integer.outer_approximation import outer_approximation
 from jaxmpc.integer.relaxer import Relaxations, Relaxer
 from jaxmpc.integer.scheduling import run
-from jaxmpc.problem.blocking import first_position_rows, moves_per_block
-from jaxmpc.problem.condense import QpInstance
+from jaxmpc.problem.blocking import moves_per_block
+from jaxmpc.problem.instance import QpInstance
+from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure
 from jaxmpc.relaxed.gap import closes
-from jaxmpc.relaxed.newton import WarmStart
-from jaxmpc.status import FINISHERS, INFEASIBLE, OPTIMAL
+from jaxmpc.status import INFEASIBLE, OPTIMAL
 
 BEAM = 64  # partial candidates kept while looking for good first moves
 HIGHS_SECONDS = 0.1  # what the reduced MILP may take before branch and bound closes the rest
@@ -39,132 +37,48 @@ UNINTERRUPTED = 0.05  # time limits from which on a search may run as one compil
 FINISHES = ("auto", "enumeration", "highs", "branch-and-bound")
 
 
-def solve_integer(
-    constants: Constants,
-    instance: QpInstance,
-    *,
-    starts: list[np.ndarray] | None = None,
-    warm: WarmStart | None = None,
-    gap: float = 1e-6,
-    time_limit: float | None = None,
-    finish: str = "auto",
-) -> SearchResult:
-    """Solve one problem with whole moves exactly.
-
-    Args:
-        constants: of the structure, model and tuning.
-        instance: the problem of this sample.
-        starts: moves of integer MVs to try as incumbents ``"integer"`` [steps]; rounded here.
-        warm: prices of a neighbouring problem's root relaxation; speeds the solve up, never changes the answer.
-        gap: relative gap at which the solve stops.
-        time_limit: seconds; the best plan so far is returned with its true gap.
-        finish: ``auto``, or the one path that has to close the problem after fixing.
-
-    Returns:
-        `SearchResult`; ``status.INFEASIBLE`` when no whole moves satisfy the hard limits.
-    """
-    one = lambda tree: jax.tree.map(lambda leaf: leaf[None], tree)  # noqa: E731
-    return solve_integers(
-        Relaxer([constants]),
-        one(instance),
-        starts=[starts or []],
-        warm=one(constants.cold if warm is None else warm),
-        gap=gap,
-        time_limit=time_limit,
-        finish=finish,
-    )[0][0]
-
-
 def solve_integers(
     relaxer: Relaxer,
     instances: QpInstance,
+    root: Relaxations,
     *,
-    starts: list[list[np.ndarray]],
-    warm: WarmStart | None = None,
-    root: Relaxations | None = None,
+    starts: Sequence[Sequence[np.ndarray]],
     gap: float = 1e-6,
     time_limit: float | None = None,
     finish: str = "auto",
-    which: Sequence[int] | np.ndarray | None = None,
-    searched: bool = False,
-) -> tuple[list[SearchResult], Relaxations]:
-    """Solve the problems of many scenarios side by side; arguments as in `solve_integer`, with a scenario axis.
+    spent: float = 0.0,
+) -> list[SearchResult]:
+    """Search the problems of many scenarios side by side on the host.
 
     Args:
         relaxer: compiled relaxations of the scenarios.
-        instances: their problems.
-        starts: incumbents to try, per scenario.
-        warm: where each root relaxation starts.
-        root: the root relaxations where they are known already, in place of `warm`.
-        gap: relative gap.
-        time_limit: seconds of work per scenario.
-        finish: path that has to close the problems.
-        which: scenarios to solve; all if not given.
-        searched: whether the compiled search has been tried.
+        instances: their problems, first axis ``"scenario"``, with NumPy's arrays.
+        root: their relaxations.
+        starts: integer moves to try as incumbents, per scenario ``"integer"`` [steps]; they never change the answer.
+        gap: relative gap at which a solve stops.
+        time_limit: seconds of work per scenario; the best plan so far is returned with its true gap.
+        finish: ``auto``, or the one path that has to close the problems after fixing.
+        spent: seconds that every scenario has taken already.
 
     Returns:
-        ``(results, roots)``: one result per scenario that was to be solved, and the solved relaxations of all.
+        One result per scenario; ``status.INFEASIBLE`` when no whole moves satisfy the hard limits.
     """
-    count = len(instances.lower)
-    begin, compiled = time.perf_counter(), relaxer.compiling
-    if root is None:
-        root = relaxer.solve_roots(instances, relaxer.fitting(warm, count))
-    seconds = time.perf_counter() - begin - (relaxer.compiling - compiled)
-    results: list[SearchResult | None] = [None] * count
-    waiting, open_searches = [], []
-    for i in range(count) if which is None else which:
+    results: list[SearchResult | None] = [None] * len(instances.lower)
+    searches = []
+    for i in range(len(results)):
         bound, value = max(float(root.bound[i]), 0.0), float(root.snapped[i])
         if finish == "auto" and closes(value, bound, relaxer.scenario(i).scale, gap):
-            results[i] = _closed_by_root(relaxer, root, i, bound, seconds / count)
+            results[i] = _closed_by_root(relaxer, root, i, bound, spent)
             continue
-        waiting.append(i)
-    if waiting and not searched and compiles(relaxer, finish, time_limit):
-        _decided_at_once(relaxer, instances, np.asarray(waiting), root, gap, seconds / count, results)
-    for i in [i for i in waiting if results[i] is None]:
-        own = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], instances)
+        own = jax.tree.map(lambda leaf, i=i: leaf[i], instances)
         search = Search(relaxer.scenario(i), own, root.part(i, i + 1), gap, time_limit)
-        search.spent = seconds / count
-        open_searches.append((i, search, _line(search, starts[i], finish)))
-    if open_searches:
-        done = run(relaxer, instances, open_searches)
-        for (i, search, _), result in zip(open_searches, done, strict=True):
-            result.seconds = search.spent
-            results[i] = result
-    return [result for result in results if result is not None], root
-
-
-def compiles(relaxer: Relaxer, finish: str, time_limit: float | None) -> bool:
-    """Whether searches may run in one compiled call, which nothing interrupts."""
-    unhurried = time_limit is None or time_limit >= UNINTERRUPTED
-    return finish == "auto" and unhurried and relaxer.tables is not None
-
-
-def _decided_at_once(
-    relaxer: Relaxer,
-    instances: QpInstance,
-    index: np.ndarray,
-    root: Relaxations,
-    gap: float,
-    spent: float,
-    results: list[SearchResult | None],
-) -> None:
-    """Results of the searches that one compiled call closes; they share its time by the relaxations they solved."""
-    begin, compiled = time.perf_counter(), relaxer.compiling
-    found = relaxer.decide(instances, index, root, gap)
-    seconds = time.perf_counter() - begin - (relaxer.compiling - compiled)
-    share = seconds * found.nodes / found.nodes.sum()
-    for lane, i in enumerate(index):
-        if found.closed[lane]:
-            results[i] = SearchResult(
-                np.asarray(found.x[lane]),
-                float(found.value[lane]),
-                float(found.bound[lane]),
-                OPTIMAL,
-                FINISHERS[int(found.finished_by[lane])],
-                int(found.nodes[lane]),
-                root.start(i),
-                spent + float(share[lane]),
-            )
+        search.spent = spent
+        searches.append((i, search, _line(search, starts[i], finish)))
+    done = run(relaxer, instances, searches)
+    for (i, search, _), result in zip(searches, done, strict=True):
+        result.seconds = search.spent
+        results[i] = result
+    return [result for result in results if result is not None]
 
 
 def _closed_by_root(
@@ -172,12 +86,13 @@ def _closed_by_root(
 ) -> SearchResult:
     """The root's own moves are whole: nothing to search."""
     x = root.x[lane].copy()
-    x[relaxer.integer] = np.round(x[relaxer.integer])
+    integer = relaxer.scenario(lane).integer
+    x[integer] = np.round(x[integer])
     value = float(root.snapped[lane])
     return SearchResult(x, value, min(bound, value), OPTIMAL, "relaxation", 1, root.start(lane), seconds)
 
 
-def _line(search: Search, starts: list[np.ndarray], finish: str) -> Steps:
+def _line(search: Search, starts: Sequence[np.ndarray], finish: str) -> Steps:
     """The whole line of one solve, from its relaxation on; returns `SearchResult`."""
     c, root, root_bound = search.constants, search.root, search.root_bound
     integer = c.integer
@@ -199,7 +114,7 @@ def _line(search: Search, starts: list[np.ndarray], finish: str) -> Steps:
     cuts.add(root, 0, low, high)
     search.offer(root, 0)
     yield from _solve_all(search, cuts, [point])
-    if not np.isfinite(search.value) and not continuous_feasible(c.structure, search.instance):
+    if not np.isfinite(search.value) and not continuous_feasible(c.structure, c.size, search.instance):
         return infeasible
     if finish == "auto" and root_bound >= search.cutoff:
         return search.finish("relaxation", root_bound)
@@ -267,7 +182,7 @@ def _best_by_model(search: Search, model: LowerModel, lower: np.ndarray, upper: 
 
 
 def _candidates(
-    search: Search, model: LowerModel, starts: list[np.ndarray], lower: np.ndarray, upper: np.ndarray
+    search: Search, model: LowerModel, starts: Sequence[np.ndarray], lower: np.ndarray, upper: np.ndarray
 ) -> list[np.ndarray]:
     """Whole moves that may be good: starts, no moves, and the best by the model."""
     simple = [np.clip(whole(w), lower, upper) for w in (*starts, np.zeros(len(lower)))]
@@ -275,24 +190,19 @@ def _candidates(
     return (fit + list(_best_by_model(search, model, lower, upper)))[:GROUP]
 
 
-def continuous_feasible(structure: Structure, instance: QpInstance) -> bool:
+def continuous_feasible(structure: Structure, size: Size, instance: QpInstance) -> bool:
     """Whether the limits of the continuous MVs leave any moves at all (exact, by reachable positions)."""
-    lower, upper = np.asarray(instance.lower), np.asarray(instance.upper)
-    counts = moves_per_block(structure)
-    blocks, firsts = structure.block_count, first_position_rows(structure)
-    row_low, row_high = np.asarray(instance.row_low), np.asarray(instance.row_high)
-    slack = 1e-7
-    for mv in range(structure.mv_count):
-        if mv in structure.integer_mvs:
-            continue
-        own_low, own_high = lower[mv * blocks : (mv + 1) * blocks], upper[mv * blocks : (mv + 1) * blocks]
-        if (own_low > own_high + slack).any():
+    counts, slack = moves_per_block(structure), 1e-7
+    by_mv = lambda values: np.reshape(values, (size.mvs, -1))  # noqa: E731
+    lower, upper = by_mv(instance.lower), by_mv(instance.upper)
+    row_low, row_high = by_mv(instance.row_low), by_mv(instance.row_high)
+    for mv in sorted(set(range(size.mvs)) - set(structure.integer_mvs)):
+        if (lower[mv] > upper[mv] + slack).any():
             return False
-        first = firsts[mv]
         least = most = 0.0
-        for b in range(blocks):
-            least = max(least + counts[b] * own_low[b], row_low[first + b])
-            most = min(most + counts[b] * own_high[b], row_high[first + b])
+        for b in range(structure.block_count):
+            least = max(least + counts[b] * lower[mv, b], row_low[mv, b])
+            most = min(most + counts[b] * upper[mv, b], row_high[mv, b])
             if least > most + slack:
                 return False
     return True

@@ -1,186 +1,378 @@
-"""Closed loops of continuous controllers as compiled programs: one, or many lanes of a sweep on several cores or devices.
+"""Closed loops on plants in JAX, many samples in one compiled call: one lane, or many on several cores or devices.
 
-`closed_loop` is the only caller; it knows what runs may be asked for, this module how they are compiled and cut into parts.
+Decision, plant and next sample stay on the device until a sample is met whose whole moves have to be decided on the host.
+One call carries out what was decided there and goes on. `loop.simulate` is the only caller.
 """
 
 from __future__ import annotations
 
+import functools
 import threading
-import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
-from jaxmpc.controller.batch import Lanes, for_all, map_lanes, per_lane, place
-from jaxmpc.controller.continuous import ContinuousController, ControllerState, StepInfo
+from jaxmpc import status as codes
+from jaxmpc.controller.controller import Controllers, considered
+from jaxmpc.controller.core import Core, Moment
 from jaxmpc.controller.measurement import received
-from jaxmpc.loop.inputs import Sweep
-from jaxmpc.loop.noise import noise_samples
-from jaxmpc.loop.trajectory import RECORDABLE
-from jaxmpc.process.plant import WellPlant
+from jaxmpc.controller.sample import Sample
+from jaxmpc.programs.clock import Clock
+from jaxmpc.programs.compilation import compiling_for
+from jaxmpc.programs.lanes import Lanes
+from jaxmpc.programs.packing import Packing, flattened, rebuilt
 from jaxmpc.programs.threads import parts_of, side_by_side
+from jaxmpc.relaxed.gap import FINEST, relative_gap
 
-CHUNK = 300  # samples between two progress reports of a compiled loop
-SIDE_BY_SIDE = 16  # lanes of one compiled call, on a CPU
-
-
-def record_of(cv, mv, state: ControllerState, info: StepInfo) -> dict[str, Any]:
-    """What a sample leaves behind, by the names of `Trajectory`; a compiled loop has no solve time yet."""
-    return dict(
-        cv=cv,
-        mv_demand=info.mv,
-        mv=mv,
-        move=info.move,
-        plan=info.moves,
-        bias=state.bias,
-        bias_raw=state.bias_raw,
-        quality=info.quality,
-        off=info.off,
-        status=info.status,
-        fallback=info.fallback,
-        objective=info.objective,
-        bound=info.bound,
-        gap=info.gap,
-        nodes=info.nodes,
-        finished_by=info.finished_by,
-    )
+LONGEST = 64  # samples of one call
+TOGETHER = 16  # scenarios of one call, on a CPU
+APART = 5  # Newton steps that take as long as the rest of a sample
 
 
-def start(controller: ContinuousController, plant: WellPlant):
-    """States of controller and plant at the plant's steady state, and what it measures there."""
-    plant_state = plant.init()
-    outputs = plant.measure(plant_state)
-    return controller.init(outputs.cv, outputs.mv), plant_state, outputs.cv, outputs.mv
+class Now(NamedTuple):
+    """A sample whose measurement is known; all arrays with a scenario axis.
 
-
-def scan(
-    controller: ContinuousController,
-    plant: WellPlant,
-    carry,
-    inputs,
-    told: Bool[Array, ""],
-    recorded=RECORDABLE,
-):
-    """Some samples of a compiled loop: measure, decide, advance the plant.
-
-    Args:
-        controller, plant: of one lane.
-        carry: from `start` or the samples before.
-        inputs: setpoints, pressure offsets, noise and faults of the sensors, ``"sample ..."``.
-        told: whether the controller is told where the actuators stand.
-        recorded: fields to keep.
+    Attributes:
+        moment: of the controllers, after the measurement.
+        plant: state of the plant.
+        cv: measured by sensors without fault.
+        mv: where the actuators stand.
+        x: the plan, scaled.
+        good: whether there is one.
+        decided: whether `x` and `good` are known.
     """
 
-    def one(carry, inputs):
-        state, plant_state, cv, mv = carry
-        setpoint, offset, error, fault = inputs
-        sound = cv + error
-        arrived = received(sound, fault, state.sensors.value)
-        state, info = controller.step(state, arrived, setpoint, jnp.where(told, mv, jnp.nan))
-        plant_state, outputs = plant.step(plant_state, state.mv, offset)
-        record = record_of(sound, outputs.mv, state, info)
-        return (state, plant_state, outputs.cv, outputs.mv), {
-            k: v for k, v in record.items() if k in recorded
-        }
-
-    return jax.lax.scan(one, carry, inputs)
+    moment: Moment
+    plant: Any
+    cv: Float[Array, "scenario cv"]
+    mv: Float[Array, "scenario mv"]
+    x: Float[Array, "scenario n"]
+    good: Bool[Array, " scenario"]
+    decided: Bool[Array, " scenario"]
 
 
-def even(total: int, most: int, multiple: int = 1) -> int:
-    """Size of equal pieces of at most `most` (or `multiple`), a multiple of `multiple`, that cover `total`."""
-    most = max(most // multiple, 1)
-    units = -(-total // multiple)
-    return multiple * -(-units // -(-units // most))
+class Seen(NamedTuple):
+    """What is kept of a measured sample: fields of `Trajectory`, and the steps that its solves took."""
+
+    cv: Array
+    bias: Array
+    bias_raw: Array
+    quality: Array
+    off: Array
+    status: Array
+    fallback: Array
+    objective: Array
+    bound: Array
+    gap: Array
+    nodes: Array
+    finished_by: Array
+    steps: Array
 
 
-def run_piece(sweep: Sweep, whole, common, index, real: int, record, mesh, tick) -> dict[str, np.ndarray]:
-    """Recorded fields "lane sample ..." of the first `real` of some lanes; on one CPU, parts of them on several cores."""
-    parts = parts_of(len(index), SIDE_BY_SIDE) if mesh.size == 1 else [np.arange(len(index))]
-    ready = [_Part(sweep, whole, common, index[part], record, mesh) for part in parts]
-    if index[0] == 0:  # compile before the clock starts
-        ready[0].compile()
-        tick(0)
-    lock = threading.Lock()
+class Done(NamedTuple):
+    """What is kept of a sample that was carried out."""
 
-    def run(k: int, stopped: Callable[[], bool]) -> dict[str, np.ndarray]:
-        its = min(max(real - int(parts[k][0]), 0), len(parts[k]))
+    mv_demand: Array
+    mv: Array
+    move: Array
+    plan: Array
 
-        def count(samples: int) -> None:
+
+class Inputs(NamedTuple):
+    """What comes from outside, of all scenarios.
+
+    Attributes:
+        setpoints: ``"scenario sample cv"`` [CV unit].
+        disturbance: ``"scenario sample"``.
+        errors: noise of the sensors, ``"scenario sample cv"`` [CV unit].
+        faults: of the sensors, as of `measurement.fault_errors`.
+        told: ``"scenario"``, whether the controller is told where the actuators stand.
+    """
+
+    setpoints: np.ndarray
+    disturbance: np.ndarray
+    errors: np.ndarray
+    faults: np.ndarray
+    told: np.ndarray
+
+
+def simulate_compiled(
+    controllers: Controllers,
+    plants: Lanes,
+    inputs: Inputs,
+    record: Collection[str],
+    *,
+    real: int | None = None,
+    devices: Sequence[Any] = (),
+    progress: Callable[[int], None] | None = None,
+) -> dict[str, np.ndarray]:
+    """Closed loops of controllers that advance together; recorded fields of `Trajectory`, ``"scenario sample ..."``.
+
+    The samples of a call share its time by the steps of their solves; what the host does is charged to its sample.
+
+    Args:
+        controllers: one per scenario.
+        plants: one plant for all, or one per scenario.
+        inputs: what comes from outside.
+        record: fields to keep.
+        real: number of scenarios that count, the others are copies; all if not given.
+        devices: to spread the scenarios over; the default one if not given.
+        progress: told how many samples of all scenarios were done, first when everything is compiled; by one thread at a
+            time.
+    """
+    lock, count = threading.Lock(), controllers.count
+    real = count if real is None else real
+    most = TOGETHER if len(devices) < 2 else -(-count // len(devices))
+    parts = parts_of(count, most, cut=len(devices) > 1)
+    places = [devices[k % len(devices)] if len(devices) > 1 else None for k in range(len(parts))]
+    runs = [
+        _Run(controllers.part(part), plants.take(part), Inputs(*(v[part] for v in inputs)), record, place)
+        for part, place in zip(parts, places, strict=True)
+    ]
+    with compiling_for(f"loops of {controllers.size}"):
+        stages = [run.start() for run in runs]
+        runs[0].stride(stages[0], 0)
+    own = [min(max(real - int(part[0]), 0), len(part)) for part in parts]
+
+    def tick(samples: int) -> None:
+        if progress is not None:
             with lock:
-                tick(its * samples)
+                progress(samples)
 
-        return {name: values[:its] for name, values in ready[k].run(count, stopped).items()}
+    def advance(k: int, stopped: Callable[[], bool]) -> dict[str, np.ndarray]:
+        fields = runs[k].advanced(stages[k], lambda samples: tick(own[k] * samples), stopped)
+        return {name: values[: own[k]] for name, values in fields.items()}
 
-    fields = side_by_side(run, range(len(parts)))
+    tick(0)
+    fields = side_by_side(advance, range(len(parts)))
     if len(fields) == 1:
         return fields[0]
     return {name: np.concatenate([f.pop(name) for f in fields]) for name in list(fields[0])}
 
 
-class _Part:
-    """Some lanes of a sweep that share every compiled call.
+class _Stage(NamedTuple):
+    """A packed sample, on the device or the host, and whether all of it is decided."""
 
-    Args:
-        sweep: all of it.
-        whole: its controllers and plants.
-        common: what these share, on the devices.
-        index: lanes.
-        record: fields to keep.
-        mesh: devices.
-    """
+    packed: Any
+    decided: bool
 
-    def __init__(self, sweep: Sweep, whole, common, index, record, mesh):
-        self.put = lambda lanes: place(lanes, mesh)
-        own = [lanes.take(index).each for lanes in whole]
-        self.loop = [self.put(Lanes(each, shared)) for each, shared in zip(own, common, strict=True)]
-        self.noise = [self.put(per_lane(v[index])) for v in (sweep.seeds, sweep.deviation)]
-        self.setpoints, self.offsets = sweep.setpoints_of(index), sweep.offsets_of(index)
-        self.faults = sweep.faults_of(index)
-        self.told = self.put(per_lane(jnp.asarray(sweep.position_feedback[index])))
-        self.samples, self.lanes, self.record, self.mesh = sweep.samples, len(index), record, mesh
-        self.length = even(sweep.samples, CHUNK)
 
-    def _arguments(self, carry, begin: int):
-        # samples beyond the end are simulated and dropped, for the sake of one shape
-        now = np.minimum(np.arange(begin, begin + self.length), self.samples - 1)
-        inputs = self.put(per_lane((self.setpoints[:, now], self.offsets[:, now], self.faults[:, now])))
-        which = self.put(for_all(jnp.asarray(begin)))
-        return [*self.loop, per_lane(carry), inputs, *self.noise, which, self.told, for_all(self.record)]
+class _Run:
+    """Loops under way, of scenarios that share every call; arguments as in `simulate_compiled`."""
 
-    def compile(self) -> None:
-        """Compile what `run` calls."""
-        carry = map_lanes(start, self.loop, self.mesh)
-        map_lanes.lower(_window, self._arguments(carry, 0), self.mesh).compile()
+    def __init__(
+        self, controllers: Controllers, plants: Lanes, inputs: Inputs, record: Collection[str], place: Any
+    ):
+        self.controllers, self.plants, self.record, self.place = controllers, plants, record, place
+        self.count, self.samples = controllers.count, inputs.setpoints.shape[1]
+        outside = [inputs.setpoints, inputs.errors, inputs.faults, inputs.disturbance[..., None]]
+        together = np.concatenate(outside, axis=2)
+        # beyond the end the last sample is repeated
+        self.inputs = np.concatenate([together, np.repeat(together[:, -1:], LONGEST + 1, axis=1)], axis=1)
+        leaves, self.form = flattened((controllers.cores, plants))
+        self.leaves = leaves if place is None else jax.device_put(leaves, place)
+        gap = np.full(self.count, max(controllers.gap, FINEST))
+        search = np.full(self.count, float(controllers.searching))
+        self.settings = np.stack([gap, search, inputs.told.astype(float)], axis=1)
 
-    def run(self, tick: Callable[[int], None], stopped: Callable[[], bool]) -> dict[str, np.ndarray]:
-        """Recorded fields "lane sample ..." of all lanes."""
-        carry = map_lanes(start, self.loop, self.mesh)
+    def start(self) -> _Stage:
+        """Before the first sample."""
+        c = self.controllers
+        plant_state, outputs = self._steady()
+        state, mv = c.init(outputs.cv, outputs.mv), outputs.mv
+        cvs = outputs.cv.shape[1]
+        cv = outputs.cv + self.inputs[:, 0, cvs : 2 * cvs]
+        rows = np.zeros((self.count, c.size.future, cvs))
+        sample = Sample(cv, rows, mv, np.zeros(mv.shape, dtype=bool))
+        shapes = jax.eval_shape(considered, c.cores, state, sample, self.settings[:, :2])
+        moment = jax.tree.map(lambda v: np.zeros(v.shape, v.dtype), shapes)._replace(state=state)
+        no: Any = np.zeros(self.count, dtype=bool)
+        now = Now(moment, plant_state, cv, mv, np.zeros_like(moment.decision.x), no, no)
+        self.of_now = Packing.of(now)
+        return _Stage(self.of_now.pack(now), False)
+
+    def _steady(self) -> tuple[Any, Any]:
+        """Steady states of the plants, and what they measure there."""
+        if self.plants.count is not None:
+            return jax.tree.map(np.asarray, _steady(self.plants))
+        plant = self.plants.shared  # outside a program its steady state may be known
+        state = plant.init()
+        lanes = lambda v: np.broadcast_to(v, (self.count, *np.shape(v)))  # noqa: E731
+        return jax.tree.map(lanes, (state, plant.measure(state)))
+
+    def stride(self, stage: _Stage, begin: int) -> tuple[_Stage, Seen, Done, int]:
+        """Carry out sample `begin` if it is decided, and go on up to one that is not.
+
+        Returns:
+            ``(stage, seen, done, count)``: the sample measured last, what was measured since, what was carried out, and how
+            many samples were measured.
+        """
+        now = self.inputs[:, begin : begin + LONGEST + 1]
+        given = (stage.packed, now, self.settings)
+        given = given if self.place is None else jax.device_put(given, self.place)
+        packed, (seen, done), (count, decided) = _stride(self.leaves, *given, self.form, self.of_now)
+        rows = lambda tree: jax.tree.map(np.asarray, tree)  # noqa: E731
+        return _Stage(packed, bool(decided)), rows(seen), rows(done), int(count)
+
+    def advanced(
+        self, stage: _Stage, tick: Callable[[int], None], stopped: Callable[[], bool]
+    ) -> dict[str, np.ndarray]:
+        """The whole run."""
         fields: dict[str, np.ndarray] = {}
-        for begin in range(0, self.samples, self.length):
-            if stopped():
-                break
-            arguments, count = self._arguments(carry, begin), min(self.length, self.samples - begin)
-            started = time.perf_counter()
-            carry, part = jax.block_until_ready(map_lanes(_window, arguments, self.mesh))
-            # as in one compiled loop: every sample gets the mean of its chunk, and lanes share the time equally
-            mean = (time.perf_counter() - started) / (self.length * self.lanes)
-            part = {name: np.asarray(value) for name, value in part.items()}
-            if "solve_time" in self.record:
-                part["solve_time"] = np.full((self.lanes, self.length), mean)
-            for name, value in part.items():
-                if name not in fields:
-                    fields[name] = np.empty((self.lanes, self.samples, *value.shape[2:]), dtype=value.dtype)
-                fields[name][:, begin : begin + count] = value[:, :count]
-            tick(count)
+        done = 0
+        while done < self.samples and not stopped():
+            clock = Clock()
+            acted = int(stage.decided)  # only the first call has nothing to carry out
+            stage, seen, doings, count = self.stride(stage, done)
+            seconds = clock.seconds
+            # the first row of what was seen is the sample after the one that was carried out first
+            first, carried = done + acted, count - 1 + acted
+            for name, values in doings._asdict().items():
+                self._put(fields, name, done, values[:, :carried])
+            work = seen.steps[:, :count] + APART
+            shares = {"solve_time": seconds * work / work.sum()}
+            for name, values in (seen._asdict() | shares).items():
+                self._put(fields, name, first, np.asarray(values[:, :count]))
+            before, done = done, done + carried
+            if done < self.samples and not stage.decided:
+                stage = self._decide(stage, fields, done)
+            if carried:
+                tick(min(done, self.samples) - before)
         return fields
 
+    def _put(self, fields: dict[str, np.ndarray], name: str, begin: int, values: np.ndarray) -> None:
+        """Write samples of a field that is kept, made when first needed; what is beyond the run is dropped."""
+        if name not in self.record:
+            return
+        if name not in fields:
+            fields[name] = np.empty((len(values), self.samples, *values.shape[2:]), dtype=values.dtype)
+        fields[name][:, begin : begin + values.shape[1]] = values[:, : max(self.samples - begin, 0)]
 
-def _window(controller, plant, carry, inputs, seed, deviation, begin, told, record):
-    """Some samples of one lane, the first of them number `begin`; `told` as in `scan`."""
-    setpoints, offsets, faults = inputs
-    errors = noise_samples(deviation, seed[0], seed[1], begin + jnp.arange(len(setpoints)))
-    return scan(controller, plant, carry, (setpoints, offsets, errors, faults), told, record)
+    def _decide(self, stage: _Stage, fields: dict[str, np.ndarray], at: int) -> _Stage:
+        """Decide sample `at` outside the stride, and record how."""
+        now: Now = self.of_now.unpack(np.array(stage.packed))
+        which = np.flatnonzero(~now.decided)
+        results = self.controllers.finish_open(now.moment, which, np.zeros(self.count))
+        x, good = now.x.copy(), now.good.copy()
+        for i, result in zip(which, results, strict=True):
+            good[i] = result.x is not None
+            value, bound = (result.value, result.bound) if good[i] else (np.nan, np.nan)
+            found = {
+                "status": result.status,
+                "fallback": not good[i],
+                "nodes": result.nodes,
+                "finished_by": codes.finisher_code(result.finished_by) if good[i] else 0,
+                "objective": value,
+                "bound": bound,
+                "gap": relative_gap(value, bound, now.moment.unit[i]),
+            }
+            for name in found.keys() & fields.keys():
+                fields[name][i, at] = found[name]
+            if "solve_time" in fields:
+                fields["solve_time"][i, at] += result.seconds
+            if result.x is not None:
+                x[i] = result.x
+        self.controllers.decided = True
+        decided: Any = np.ones(self.count, dtype=bool)
+        return _Stage(self.of_now.pack(now._replace(x=x, good=good, decided=decided)), True)
+
+
+@eqx.filter_jit
+def _steady(plants: Lanes):
+    def lane(own):
+        plant = eqx.combine(own, plants.shared)
+        state = plant.init()
+        return state, plant.measure(state)
+
+    return jax.vmap(lane)(plants.each)
+
+
+@functools.partial(jax.jit, static_argnames=("form", "of_now"))
+def _stride(leaves, packed, inputs, settings, form, of_now: Packing):
+    """See `_Run.stride`."""
+    cores, plants = rebuilt(form, leaves)
+    now: Now = of_now.unpack(packed)
+    cvs, mvs, future = now.cv.shape[1], now.mv.shape[1], now.moment.free_response.shape[1]
+    setpoints, errors, faults = (inputs[..., k * cvs : (k + 1) * cvs] for k in range(3))
+    disturbance, told = inputs[..., -1], settings[:, 2:] > 0
+    late = now.decided[0].astype(int)  # measured is sample `late`, then late + 1, ...
+
+    def carry_out(now: Now, at) -> tuple[Now, Done]:
+        def plan(own, moment, x, good):
+            core: Core = eqx.combine(own, cores.shared)
+            return core.carry_out(moment, x, good)
+
+        state, moves = jax.vmap(plan)(cores.each, now.moment, now.x, now.good)
+
+        def advance(own, plant_state, mv, offset):
+            return eqx.combine(own, plants.shared).step(plant_state, mv, offset)
+
+        plant_state, outputs = jax.vmap(advance)(plants.each, now.plant, state.mv, disturbance[:, at])
+        now = now._replace(
+            moment=now.moment._replace(state=state),
+            plant=plant_state,
+            cv=outputs.cv + errors[:, at + 1],
+            mv=outputs.mv,
+        )
+        return now, Done(state.mv, outputs.mv, moves[:, 0], moves)
+
+    def forward(carry):
+        now, seen, done, count = carry
+        at = late + count - 1  # sample to carry out; -1 for none
+        nothing = Done(now.mv, now.mv, now.mv, now.moment.state.plan)
+        now, did = jax.lax.cond(
+            at >= 0, lambda: carry_out(now, at), lambda: (now, jax.tree.map(jnp.zeros_like, nothing))
+        )
+        row = jnp.where(at >= 0, at, LONGEST + 1)  # out of range: not written
+        done = jax.tree.map(lambda rows, new: rows.at[:, row].set(new, mode="drop"), done, did)
+        before = now.moment.state
+        held = jnp.broadcast_to(setpoints[:, at + 1, None], (now.cv.shape[0], future, cvs))
+        sample = Sample(
+            cv=received(now.cv, faults[:, at + 1], before.sensors.value),
+            setpoint=held,
+            mv=jnp.where(told, now.mv, jnp.nan),
+            manual=jnp.zeros(now.mv.shape, dtype=bool),
+        )
+        moment = considered(cores, before, sample, settings[:, :2])
+        found, state = moment.decision, moment.state
+        good = found.closed & jnp.isfinite(found.x).all(axis=1)
+        whole = cores.value.tables.count > 0
+        decided = good | ~whole
+        certified = lambda value: jnp.where(good, value, jnp.nan)  # noqa: E731
+        kept = Seen(
+            cv=now.cv,
+            bias=state.bias,
+            bias_raw=state.bias_raw,
+            quality=state.sensors.quality,
+            off=state.sensors.off,
+            status=jnp.where(good, codes.OPTIMAL, codes.FAILED),
+            fallback=~good,
+            objective=certified(found.value),
+            bound=certified(found.bound),
+            gap=certified(relative_gap(found.value, found.bound, moment.unit)),
+            nodes=jnp.where(whole, found.nodes, found.steps),
+            finished_by=jnp.where(good, found.finished_by, 0),
+            steps=found.steps,
+        )
+        seen = jax.tree.map(lambda rows, new: rows.at[:, count].set(new), seen, kept)
+        return now._replace(moment=moment, x=found.x, good=good, decided=decided), seen, done, count + 1
+
+    def onward(carry):
+        now, *_, count = carry
+        return (count == 0) | (now.decided.all() & (count < LONGEST))
+
+    table = lambda *shape, dtype=float: jnp.zeros((now.cv.shape[0], LONGEST + 1, *shape), dtype=dtype)  # noqa: E731
+    whole, flag = (functools.partial(table, dtype=kind) for kind in (int, bool))
+    numbers = table(), table(), table()
+    seen = Seen(
+        *(table(cvs), table(cvs), table(cvs), whole(cvs), flag(cvs)),
+        *(whole(), flag(), *numbers, whole(), whole(), whole()),
+    )
+    done = Done(table(mvs), table(mvs), table(mvs), table(*now.moment.state.plan.shape[1:]))
+    now, seen, done, count = jax.lax.while_loop(onward, forward, (now, seen, done, 0))
+    return of_now.pack(now), (seen, done), (count, now.decided.all())

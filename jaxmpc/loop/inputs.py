@@ -10,14 +10,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxmpc.controller.batch import Lanes, for_all
-from jaxmpc.controller.continuous import ContinuousController
-from jaxmpc.controller.mixed_integer import MixedIntegerControllers
+from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.errors import InputError
-from jaxmpc.loop.noise import check_deviation, check_seed
+from jaxmpc.loop.compiled import Inputs
+from jaxmpc.loop.noise import check_deviation, check_seed, errors_of
 from jaxmpc.loop.reference import Reference
 from jaxmpc.problem.structure import Structure
 from jaxmpc.process.plant import WellPlant
+from jaxmpc.programs.lanes import Lanes, for_all
 
 
 def check_match(structure: Structure, plant) -> None:
@@ -54,22 +54,11 @@ def check_faults(faults: np.ndarray, *shapes: tuple[int, ...]) -> None:
         raise InputError("faults", f"shape {list(faults.shape)}", f"{expected} errors, one per sample and CV")
 
 
-def _structure(controllers: Lanes[ContinuousController] | MixedIntegerControllers) -> Structure:
-    lanes = isinstance(controllers, Lanes)
-    return controllers.shared.structure if lanes else controllers.structure
-
-
-def _hides_lanes(controllers: Lanes[ContinuousController]) -> bool:
-    """Whether arrays that count as shared have a lane axis."""
-    shared = controllers.each.tuning.bias_cutoff is None
-    return shared and np.ndim(controllers.value.tuning.bias_cutoff) > 0
-
-
 @dataclasses.dataclass(frozen=True)
 class Sweep:
     """All lanes of a sweep on the host, checked."""
 
-    controllers: Lanes[ContinuousController] | MixedIntegerControllers
+    controllers: Controllers
     plants: Lanes[WellPlant]
     setpoints: Sequence[np.ndarray]  # one for all, or one per lane
     offsets: np.ndarray  # "sample" or "lane sample"
@@ -83,21 +72,21 @@ class Sweep:
     @property
     def structure(self) -> Structure:
         """Of the controllers, the same in every lane."""
-        return _structure(self.controllers)
+        return self.controllers.structure
 
     @classmethod
     def checked(
         cls, controllers, plants, reference, samples, disturbance, noise, seed, faults, position_feedback
     ) -> Sweep:
         """The sweep, or an `InputError` that names what does not fit."""
-        if not isinstance(controllers, (Lanes, MixedIntegerControllers)):
-            controllers = for_all(controllers)
-        plants = plants if isinstance(plants, Lanes) else for_all(plants)
-        if isinstance(controllers, Lanes) and _hides_lanes(controllers):
+        if isinstance(controllers, Controller):
+            controllers = controllers.lanes
+        if not isinstance(controllers, Controllers):
             raise InputError(
-                "controllers", "arrays with a lane axis", "Lanes", "Wrap a batch of your own in `per_lane`"
+                "controllers", type(controllers).__name__, "Controllers, or a Controller for all"
             )
-        structure = _structure(controllers)
+        plants = plants if isinstance(plants, Lanes) else for_all(plants)
+        structure = controllers.structure
         check_match(structure, plants.shared)
         own_references = not isinstance(reference, Reference)
         references = list(reference) if own_references else [reference]
@@ -114,7 +103,9 @@ class Sweep:
             raise InputError("position_feedback", position_feedback, "true or false, or one of them per lane")
         deviation, seed = check_deviation(noise, structure.cv_count), check_seed(seed)
         counts = {
-            "controllers": controllers.count,
+            "controllers": controllers.count
+            if controllers.count > 1 or controllers.scenarios.lanes
+            else None,
             "plants": plants.count,
             "reference": len(references) if own_references else None,
             "disturbance": len(offsets) if offsets.ndim == 2 else None,
@@ -145,20 +136,29 @@ class Sweep:
             count=count,
         )
 
+    def controllers_of(self, index: np.ndarray) -> Controllers:
+        """The controllers of some lanes."""
+        if self.controllers.count == 1:
+            return self.controllers.repeated(len(index))
+        return self.controllers.part(index)
+
+    def inputs_of(self, index: np.ndarray) -> Inputs:
+        """What comes from outside, of some lanes."""
+        return Inputs(
+            setpoints=self.setpoints_of(index),
+            disturbance=self._of(self.offsets, 2, index),
+            errors=errors_of(self.deviation[index], self.seeds[index], self.samples),
+            faults=self._of(self.faults, 3, index),
+            told=self.position_feedback[index],
+        )
+
     def setpoints_of(self, index: np.ndarray) -> np.ndarray:
         """Setpoints "lane sample cv" of some lanes; no copies where all are the same."""
         if len(self.setpoints) == 1:
             return np.broadcast_to(self.setpoints[0], (len(index), *self.setpoints[0].shape))
         return np.stack([self.setpoints[k] for k in index])
 
-    def offsets_of(self, index: np.ndarray) -> np.ndarray:
-        """Pressure offsets "lane sample" of some lanes [bar]."""
-        if self.offsets.ndim == 1:
-            return np.broadcast_to(self.offsets, (len(index), self.samples))
-        return self.offsets[index]
-
-    def faults_of(self, index: np.ndarray) -> np.ndarray:
-        """Errors of the sensors "lane sample cv" of some lanes [CV unit]."""
-        if self.faults.ndim == 2:
-            return np.broadcast_to(self.faults, (len(index), *self.faults.shape))
-        return self.faults[index]
+    @staticmethod
+    def _of(values: np.ndarray, axes: int, index: np.ndarray) -> np.ndarray:
+        """Those of some lanes, where there is a lane axis or not."""
+        return values[index] if values.ndim == axes else np.broadcast_to(values, (len(index), *values.shape))

@@ -11,13 +11,16 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxmpc.controller.continuous import ControllerState
+from jaxmpc.controller.controller import Controller
+from jaxmpc.controller.core import ControllerState
 from jaxmpc.errors import InputError
 from jaxmpc.problem.blocking import sample_moves
 from jaxmpc.problem.structure import Structure
 
 
-def checked_changes(controller: Any, changes: Sequence[tuple[float, Any]], samples: int) -> dict[int, Any]:
+def checked_changes(
+    controller: Controller, changes: Sequence[tuple[float, Controller]], samples: int
+) -> dict[int, Controller]:
     """Controllers that take over by the first sample they decide.
 
     Args:
@@ -35,18 +38,18 @@ def checked_changes(controller: Any, changes: Sequence[tuple[float, Any]], sampl
         if sample <= before:
             earlier = f"after {before * structure.dt:g} s, the start or the change before"
             raise InputError(f"changes[{i}].time", time, f"a time at least one sample {earlier}")
-        if type(other) is not type(controller) or other.structure != structure:
+        if not isinstance(other, Controller) or other.structure != structure:
             raise InputError(
                 f"changes[{i}].controller",
                 type(other).__name__,
                 "a controller of the structure it takes over",
             )
-        lengths = [c.memory.coefficients.shape[-1] for c in (controller, other)]
+        lengths = [c.lanes.size.future for c in (controller, other)]
         if lengths[0] != lengths[1]:
             raise InputError(
                 f"changes[{i}].controller",
-                f"{lengths[1]} coefficients",
-                f"a model of {lengths[0]}, as before",
+                f"a shift register of {lengths[1]} samples",
+                f"a model whose register has {lengths[0]}, as before",
             )
         out[sample] = other
         before = sample

@@ -31,6 +31,24 @@ def noise_samples(
     return deviation * jax.vmap(draw)(samples)
 
 
+def errors_of(deviation: np.ndarray, seeds: np.ndarray, samples: int) -> np.ndarray:
+    """Measurement noise of whole runs, ``"lane sample cv"`` [CV unit].
+
+    Args:
+        deviation: standard deviations ``"lane cv"`` [CV unit].
+        seeds: seeds with streams ``"lane 2"``.
+        samples: length of the runs.
+    """
+    if not deviation.any():
+        return np.zeros((len(deviation), samples, deviation.shape[1]))
+    return np.asarray(_errors(deviation, seeds, np.arange(samples)))
+
+
+@jax.jit
+def _errors(deviation, seeds, samples):
+    return jax.vmap(lambda d, s: noise_samples(d, s[0], s[1], samples))(deviation, seeds)
+
+
 def check_deviation(given, cvs: int) -> np.ndarray:
     """Standard deviations ``"cv"`` or ``"lane cv"`` as an array; zeros for None.
 

@@ -1,48 +1,40 @@
 """Closed loops (thesis chapter 7): a controller, a plant and a reference make a `Trajectory`.
 
-A continuous controller on the JAX well runs as one compiled scan, and `simulate_batches` runs many side by side, some lanes
-and some samples at a time. Everything else (the FMU, integer moves) steps on the host with the very same controller code.
+On a plant in JAX many samples run in one compiled call, and `simulate_batches` runs many loops side by side, some lanes and
+some samples at a time. Everything else (the FMU, controllers that take over) steps on the host with the very same programs.
 """
 
 from __future__ import annotations
 
-import contextlib
-import gc
-import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from jaxmpc.controller.batch import Lanes, for_all, place, variant_mesh
-from jaxmpc.controller.continuous import ContinuousController, ControllerState
-from jaxmpc.controller.measurement import received
-from jaxmpc.controller.mixed_integer import MixedIntegerController, MixedIntegerControllers
+from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.errors import InputError
-from jaxmpc.loop.compiled import CHUNK, even, record_of, run_piece, scan, start
+from jaxmpc.loop.compiled import Inputs, simulate_compiled
+from jaxmpc.loop.host import simulate_on_host
 from jaxmpc.loop.inputs import Sweep, check_faults, check_match, check_offsets, sampled
-from jaxmpc.loop.interventions import CarriedOut, checked_changes, checked_sample, handed_over
-from jaxmpc.loop.noise import check_deviation, check_seed, noise_samples
+from jaxmpc.loop.interventions import checked_changes, checked_sample
+from jaxmpc.loop.noise import check_deviation, check_seed, errors_of
 from jaxmpc.loop.reference import Reference
-from jaxmpc.loop.strides import able, simulate_in_strides
-from jaxmpc.loop.together import advance_together, errors_of
 from jaxmpc.loop.trajectory import RECORDABLE, Trajectory, TrajectoryBatch
 from jaxmpc.problem.structure import Structure
 from jaxmpc.process.plant import WellPlant
 from jaxmpc.process.stateful import StatefulPlant
 from jaxmpc.process.well.host import HostWell
+from jaxmpc.programs.lanes import Lanes, for_all
 
 LANES = 256  # of a sweep that run side by side
 Progress = Callable[[int, int], None]
 
 
 def simulate(
-    controller: ContinuousController | MixedIntegerController,
+    controller: Controller,
     plant: WellPlant | StatefulPlant,
     reference: Reference,
     *,
@@ -52,7 +44,7 @@ def simulate(
     seed: int = 0,
     faults: Float[ArrayLike, "sample cv"] | None = None,
     position_feedback: bool = False,
-    changes: Sequence[tuple[float, ContinuousController | MixedIntegerController]] = (),
+    changes: Sequence[tuple[float, Controller]] = (),
     open_loop_from: float | None = None,
     keep_plans: bool = False,
     progress: Progress | None = None,
@@ -60,7 +52,7 @@ def simulate(
     """Close the loop from the plant's steady state at its default working point.
 
     Args:
-        controller: continuous or mixed-integer.
+        controller: with whole moves or without.
         plant: `WellPlant`, or a stateful plant with `init()`, `step(mv, disturbance)` and `dt`, such as the FMU's.
         reference: setpoints, covering the run.
         samples: length of the run; the whole reference if not given.
@@ -91,30 +83,38 @@ def simulate(
     deviation, stream = check_deviation(noise, structure.cv_count), check_seed(seed)
     if deviation.ndim > 1 or stream.ndim:
         raise InputError("noise", noise, "one standard deviation per CV and one seed, for one run")
-    errors = np.zeros((len(setpoints), structure.cv_count))
-    if deviation.any():
-        errors = np.asarray(_noise(deviation, stream, 0, np.arange(len(setpoints))))
+    errors = errors_of(deviation[None], np.array([[int(stream), 0]]), len(setpoints))
     failing = np.zeros_like(setpoints) if faults is None else np.asarray(faults, dtype=np.float64)
     check_faults(failing, setpoints.shape)
-    inputs, told = (setpoints, offsets, errors, failing), position_feedback
+    told = np.array([bool(position_feedback)])
+    inputs = Inputs(setpoints[None], offsets[None], errors, failing[None], told)
     takeovers, blind = checked_changes(controller, changes, len(setpoints)), None
     if open_loop_from is not None:
         blind = checked_sample("open_loop_from", open_loop_from, structure, len(setpoints))
         if takeovers and max(takeovers) > blind:
             raise InputError("open_loop_from", open_loop_from, "a time after the last of changes")
-    plain = isinstance(plant, WellPlant) and not takeovers and blind is None
-    if plain and isinstance(controller, ContinuousController):
-        record = _simulate_compiled(controller, plant, inputs, told, progress, keep_plans)
-    elif plain and isinstance(controller, MixedIntegerController) and able(controller.together):
-        record = _simulate_in_strides(controller.together, plant, inputs, told, progress)
+    if isinstance(plant, WellPlant) and not takeovers and blind is None and controller.compiled:
+        record = _one_lane(controller.lanes, plant, inputs, (*RECORDABLE, "plan"), progress)
     else:
-        record = _simulate_on_host(controller, plant, inputs, told, progress, takeovers, blind)
-    if not keep_plans:
-        record.pop("plan", None)
-    return Trajectory(setpoint=setpoints, **record, **_labels(structure, len(setpoints)))
+        host = HostWell(plant) if isinstance(plant, WellPlant) else plant
+        record = simulate_on_host(host, inputs, {0: controller, **takeovers}, blind, progress)
+    plan = record.pop("plan")[:, : structure.block_count]
+    kept = {"plan": plan} if keep_plans else {}
+    return Trajectory(setpoint=setpoints, **record, **kept, **_labels(structure, len(setpoints)))
 
 
-_noise = jax.jit(noise_samples)
+def _one_lane(controllers: Controllers, plant, inputs: Inputs, record, progress: Progress | None):
+    """A compiled loop of one controller."""
+    done, total = 0, inputs.setpoints.shape[1]
+
+    def tick(samples: int) -> None:
+        nonlocal done
+        done += samples
+        if progress is not None and done:
+            progress(done, total)
+
+    fields = simulate_compiled(controllers, for_all(plant), inputs, record, progress=tick)
+    return {name: values[0] for name, values in fields.items()}
 
 
 def _labels(structure: Structure, samples: int) -> dict[str, Any]:
@@ -129,135 +129,6 @@ def _labels(structure: Structure, samples: int) -> dict[str, Any]:
     )
 
 
-# ------------------------------------------------------------------------------------------------ compiled
-
-
-_run_chunk: Any = eqx.filter_jit(scan)
-
-
-def _simulate_compiled(controller, plant, inputs, told: bool, progress: Progress | None, keep_plans: bool):
-    recorded = (*RECORDABLE, "plan") if keep_plans else RECORDABLE
-    carry = start(controller, plant)
-    total, parts = len(inputs[0]), []
-    ready: set[int] = set()
-    for begin in range(0, total, CHUNK):
-        now = jax.tree.map(lambda leaf, at=begin: leaf[at : at + CHUNK], inputs)
-        count = len(now[0])
-        if count not in ready:  # compile before the clock starts
-            _run_chunk.lower(controller, plant, carry, now, jnp.asarray(told), recorded).compile()
-            ready.add(count)
-        started = time.perf_counter()
-        carry, record = jax.block_until_ready(
-            _run_chunk(controller, plant, carry, now, jnp.asarray(told), recorded)
-        )
-        # a compiled loop has no clock: every sample of a chunk gets the chunk's mean, plant included
-        mean = (time.perf_counter() - started) / count
-        parts.append(jax.tree.map(np.asarray, record) | {"solve_time": np.full(count, mean)})
-        if progress is not None:
-            progress(begin + count, total)
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-
-
-def _simulate_in_strides(
-    controllers: MixedIntegerControllers, plant, inputs, told: bool, progress: Progress | None
-):
-    """A single mixed-integer controller."""
-    done, total = 0, len(inputs[0])
-
-    def tick(samples: int):
-        nonlocal done
-        done += samples
-        if progress is not None and done:
-            progress(done, total)
-
-    fields = simulate_in_strides(
-        controllers, for_all(plant), tuple(v[None] for v in inputs), np.array([told]), tick
-    )
-    return {name: values[0] for name, values in fields.items()}
-
-
-# ------------------------------------------------------------------------------------------------- on the host
-
-
-def _simulate_on_host(
-    controller, plant, inputs, told: bool, progress: Progress | None, takeovers: dict, blind: int | None
-):
-    setpoints, offsets, errors, faults = inputs
-    host = HostWell(plant) if isinstance(plant, WellPlant) else plant
-    outputs = host.init()
-    now = np.asarray(outputs.cv)
-    steppers, states = {}, {}
-    for k, one in {0: controller, **takeovers}.items():
-        steppers[k] = _BatchOfOne(one.together) if isinstance(one, MixedIntegerController) else _Compiled(one)
-        states[k] = steppers[k].init(now, np.asarray(outputs.mv))
-        steppers[k].prepare(states[k], now)  # compile before the clock starts
-    stepper, state = steppers[0], states[0]
-    records, carried = [], None
-    with _undisturbed():
-        for k in range(len(setpoints)):
-            cv = np.asarray(outputs.cv) + errors[k]
-            if k in takeovers:
-                stepper, state = steppers[k], handed_over(state, states[k])
-            if carried is None or blind is None:
-                mv = np.asarray(outputs.mv) if told else None
-                state, record = stepper.step(state, cv, faults[k], setpoints[k], mv)
-                carried = CarriedOut(controller.structure, record) if k == blind else None
-            else:
-                record = carried.record(k - blind, cv)
-            outputs = host.step(record["mv_demand"], float(offsets[k]))
-            records.append(record | {"mv": np.asarray(outputs.mv)})
-            if progress is not None and ((k + 1) % 20 == 0 or k + 1 == len(setpoints)):
-                progress(k + 1, len(setpoints))
-    return {name: np.stack([record[name] for record in records]) for name in records[0]}
-
-
-@contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """No search for garbage among what is there already: compiled programs would keep it busy for a fifth of a second."""
-    if gc.get_freeze_count():  # the caller's business
-        yield
-        return
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
-
-
-class _Compiled:
-    """A continuous controller that is stepped from the host, with a clock."""
-
-    def __init__(self, controller: ContinuousController):
-        self.init, self._decided = controller.init, controller.step  # binding a method takes a while
-
-    def prepare(self, state, cv) -> None:
-        jax.block_until_ready(self._decided(state, cv, cv))
-
-    def step(self, state, cv, fault, setpoint, mv):
-        arrived = received(cv, fault, np.asarray(state.sensors.value))
-        begin = time.perf_counter()
-        state, info = jax.block_until_ready(self._decided(state, arrived, setpoint, mv))
-        record = record_of(cv, info.mv, state, info) | {"solve_time": time.perf_counter() - begin}
-        return state, {name: np.asarray(value) for name, value in record.items()}
-
-
-class _BatchOfOne:
-    """One mixed-integer controller, its state kept with the scenario axis."""
-
-    def __init__(self, controllers: MixedIntegerControllers):
-        self.controllers, self.prepare = controllers, lambda state, cv: controllers.prepare(state, cv[None])
-
-    def init(self, cv, mv) -> ControllerState:
-        return self.controllers.init(cv[None], mv[None])
-
-    def step(self, state, cv, fault, setpoint, mv):
-        arrived = received(cv[None], fault[None], np.asarray(state.sensors.value))
-        position = None if mv is None else mv[None]
-        state, info = self.controllers.step(state, arrived, setpoint[None], position)
-        record = record_of(cv[None], info.mv, state, info) | {"solve_time": info.solve_time}
-        return state, {name: value[0] for name, value in record.items()}
-
-
 # ------------------------------------------------------------------------------------------------------- sweeps
 
 
@@ -270,7 +141,7 @@ def simulate_batch(*arguments: Any, **options: Any) -> list[Trajectory]:
 
 
 def simulate_batches(
-    controllers: Lanes[ContinuousController] | ContinuousController | MixedIntegerControllers,
+    controllers: Controllers | Controller,
     plants: Lanes[WellPlant] | WellPlant,
     reference: Reference | Sequence[Reference],
     *,
@@ -292,9 +163,8 @@ def simulate_batches(
     Results depend neither on the size of the pieces nor on the number of devices.
 
     Args:
-        controllers: one, or `Lanes` such as those of `batch.controller_batch`; or `MixedIntegerControllers`, which advance
-            together, all in one piece.
-        plants: one well, or `Lanes` of wells (`batch.per_lane`).
+        controllers: one for all, or one per lane.
+        plants: one well, or `Lanes` of wells (`lanes.per_lane`).
         reference: setpoints for all, or a list with one reference per lane.
         samples: length of the runs; the whole (shortest) reference if not given.
         disturbance: reservoir-pressure offset [bar], ``"sample"`` or ``"lane sample"``; none if not given.
@@ -324,10 +194,10 @@ def simulate_batches(
         raise InputError("record", unknown[0], f"some of {', '.join(RECORDABLE)}")
     if lanes_at_once < 1:
         raise InputError("lanes_at_once", lanes_at_once, "1 or more lanes")
-    return _pieces(sweep, tuple(record), lanes_at_once, variant_mesh(devices), progress)
+    return _pieces(sweep, tuple(record), lanes_at_once, list(devices or jax.local_devices()), progress)
 
 
-def _pieces(sweep: Sweep, record, lanes_at_once: int, mesh, progress) -> Iterator[TrajectoryBatch]:
+def _pieces(sweep: Sweep, record, lanes_at_once: int, devices, progress) -> Iterator[TrajectoryBatch]:
     done = 0
 
     def tick(samples: int):
@@ -336,47 +206,24 @@ def _pieces(sweep: Sweep, record, lanes_at_once: int, mesh, progress) -> Iterato
         if progress is not None:
             progress(done, sweep.count * sweep.samples)
 
-    if isinstance(sweep.controllers, MixedIntegerControllers):
-        everyone = np.arange(sweep.count)
-        errors = errors_of(sweep.deviation, sweep.seeds, np.arange(sweep.samples))
-        inputs = (
-            sweep.setpoints_of(everyone),
-            sweep.offsets_of(everyone),
-            errors,
-            sweep.faults_of(everyone),
-        )
-        told = sweep.position_feedback
-        if able(sweep.controllers):
-            together = simulate_in_strides(sweep.controllers, sweep.plants, inputs, told, tick)
-            yield TrajectoryBatch(
-                lanes=everyone,
-                setpoint=inputs[0],
-                fields={name: together[name] for name in record},
-                **_labels(sweep.structure, sweep.samples),
-            )
-            return
-
-        def keep(cv, mv, state, info):
-            fields = record_of(cv, mv, state, info) | {"solve_time": info.solve_time}
-            return {name: value for name, value in fields.items() if name in record}
-
-        yield TrajectoryBatch(
-            lanes=everyone,
-            setpoint=inputs[0],
-            fields=advance_together(sweep.controllers, sweep.plants, inputs, told, keep, tick),
-            **_labels(sweep.structure, sweep.samples),
-        )
-        return
-    size = even(sweep.count, lanes_at_once, mesh.size)
-    whole = sweep.controllers, sweep.plants
-    common = [place(for_all(lanes.shared), mesh).shared for lanes in whole]
+    pieces = -(-sweep.count // lanes_at_once)
+    size = -(-sweep.count // pieces)
     for begin in range(0, sweep.count, size):
         # the last piece is filled up with copies of the last lane: one shape, one compilation
         index = np.minimum(np.arange(begin, begin + size), sweep.count - 1)
         real = min(size, sweep.count - begin)
+        report = tick if begin == 0 else lambda samples: tick(samples) if samples else None
         yield TrajectoryBatch(  # no name keeps it: it is gone when the caller lets go
             lanes=index[:real],
             setpoint=sweep.setpoints_of(index[:real]),
-            fields=run_piece(sweep, whole, common, index, real, record, mesh, tick),
+            fields=simulate_compiled(
+                sweep.controllers_of(index),
+                sweep.plants.take(index),
+                sweep.inputs_of(index),
+                record,
+                real=real,
+                devices=devices,
+                progress=report,
+            ),
             **_labels(sweep.structure, sweep.samples),
         )

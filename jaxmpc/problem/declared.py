@@ -13,9 +13,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from jaxmpc.check import LARGEST
 from jaxmpc.errors import InputError
-
-LARGEST = 1e30  # size of a number from which on it cannot be meant, and products of squares overflow
 
 
 @dataclasses.dataclass(frozen=True)

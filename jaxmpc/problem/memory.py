@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from jaxmpc.errors import InputError
+from jaxmpc.problem.condense import SUMMED_BYTES
 from jaxmpc.problem.structure import Structure
-from jaxmpc.relaxed.gram import SUMMED_LIMIT
 
 BUDGET = 4 * 2**30  # bytes that one problem may take
 FARTHEST = 10**12  # whole steps that a move may be away; with block lengths far below what 64 bits hold
@@ -29,7 +29,7 @@ def check_size(structure: Structure) -> None:
     moves = structure.mv_count * structure.block_count
     numbers = (
         _DENSE * (rows + structure.control_horizon) * moves
-        + _SUMS * rows * (moves * (moves + 1) // 2) * (moves <= SUMMED_LIMIT)
+        + min(_SUMS * rows * (moves * (moves + 1) // 2), _SUMS * SUMMED_BYTES // _NUMBER)
         + _SQUARE * moves**2
     )
     if _NUMBER * numbers > BUDGET:

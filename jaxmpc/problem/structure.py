@@ -1,7 +1,7 @@
-"""What fixes the shapes of a controller: horizons, blocks, names and which MVs are integer (thesis 5.1, 6.1, 6.2).
+"""The structure of a controller: horizons, blocks, names and which MVs are integer (thesis 5.1, 6.1, 6.2).
 
-A `Structure` is static: two controllers with equal structures share one compiled program. Everything that a
-sweep varies without recompiling is in `tuning.Tuning`.
+Programs are compiled for its size only (`layout`), and see what follows from it as arrays; weights and limits are in
+`tuning.Tuning`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ from typing import Literal
 import numpy as np
 
 from jaxmpc import html
+from jaxmpc.check import LARGEST
 from jaxmpc.errors import InputError
-from jaxmpc.problem.declared import LARGEST as LARGEST
+from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.declared import declare, declared
 
 THESIS_BLOCKS = (1, 1, 1, 1, 2, 2, 4, 4, 8, 8, 8, 16, 16, 32, 32, 64)  # (6.3)
@@ -143,18 +144,15 @@ class Structure:
         return dataclasses.replace(self, integer_step=())
 
 
-def check_vector(path: str, value, names: tuple[str, ...], unit: str) -> np.ndarray:
-    """A finite vector with one entry per name, or an `InputError`."""
-    array = np.asarray(value, dtype=np.float64)
-    if array.shape != (len(names),) or not sound(array).all():
-        raise InputError(
-            path,
-            np.asarray(value).tolist(),
-            f"{len(names)} finite numbers of size {LARGEST:g} at most [{unit}] for {', '.join(names)}",
-        )
-    return array
-
-
-def sound(values: np.ndarray) -> np.ndarray:
-    """Which numbers are finite and not beyond `LARGEST`."""
-    return np.abs(values) <= LARGEST
+def check_match(structure: Structure, model: StepResponseModel, path: str = "model") -> None:
+    """Refuse a model whose names or sampling interval differ from the structure's; errors begin with the path."""
+    for key, ours, theirs in (
+        ("cv", structure.cv_names, model.cv_names),
+        ("mv", structure.mv_names, model.mv_names),
+    ):
+        if ours != theirs:
+            raise InputError(
+                f"{path}.{key}", list(theirs), f"the structure's names in its order, {list(ours)}"
+            )
+    if abs(structure.dt - model.dt) > 1e-9 * structure.dt:
+        raise InputError(f"{path}.dt", model.dt, f"the structure's sampling interval {structure.dt} s")

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxmpc import html
+from jaxmpc.check import LARGEST
 from jaxmpc.errors import InputError
-from jaxmpc.problem.declared import LARGEST, declare, declared
+from jaxmpc.problem.declared import declare, declared
 from jaxmpc.problem.structure import Structure
 
 _cv, _mv = partial(declare, of="cv"), partial(declare, of="mv")

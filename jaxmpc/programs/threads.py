@@ -30,9 +30,12 @@ def cores() -> int:
     return max(int(given), 1) if given.isdecimal() else len(os.sched_getaffinity(0))
 
 
-def parts_of(count: int, most: int) -> list[np.ndarray]:
-    """Positions 0..count - 1 in parts of equal size, the last filled up with the last position; one on an accelerator."""
-    if jax.default_backend() != "cpu":
+def parts_of(count: int, most: int, *, cut: bool = False) -> list[np.ndarray]:
+    """Positions 0..count - 1 in parts of equal size, the last filled up with the last position.
+
+    On an accelerator it is one part, unless it has to be `cut`.
+    """
+    if jax.default_backend() != "cpu" and not cut:
         most = count
     number = -(-count // most)
     size = -(-count // number)

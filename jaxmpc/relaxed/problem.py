@@ -1,7 +1,7 @@
 """The relaxed problem itself: its value, its scale, its Newton matrix, its solution type and its dual bound.
 
-`qp` and `newton` are two methods for it; `relaxation` combines them. Both work on a `Prepared` lane, in which the
-objective is divided by a unit that brings curvatures and prices to the order of one.
+`newton` solves a `Prepared` lane, in which the objective is divided by a unit that brings curvatures and prices to the
+order of one.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxmpc.problem.condense import CondensedQp, QpInstance
-from jaxmpc.relaxed.gram import gram
+from jaxmpc.problem.condense import CondensedQp
+from jaxmpc.problem.gram import gram
+from jaxmpc.problem.instance import QpInstance
 from jaxmpc.status import FAILED, OPTIMAL
 
 FIXED = 1e-9  # box width [scaled moves] below which a variable is a constant
@@ -23,6 +24,7 @@ TINY = 1e-300
 FEASIBLE = 1e-8  # hard rows and limits, in scaled moves
 ACCEPTED = 1e-6  # relative duality gap up to which a solution counts as solved
 RIDGE = 1e-13  # on the diagonal of a Newton matrix, whose entries are of the order of one
+MANY = 16  # active CV limits from which on they are summed by where they change along the horizon
 LEAST_SHARE = 1e-7  # of the solver unit: objectives below it have their gap measured against it
 
 
@@ -34,12 +36,13 @@ class QpSolution(eqx.Module):
         objective: value of the relaxed problem at x, constants included.
         bound: lower bound of the relaxed problem from the multipliers, constants included; valid for any status.
         status: `status.OPTIMAL` or `status.FAILED`.
-        iterations: Newton steps and interior-point iterations.
-        row_price: multiplier of every row's deadzone cost (subgradient in t).
-        limit_price: net price of the CV limits per prediction row (high minus low).
+        iterations: Newton steps.
+        row_price: multiplier of every prediction's deadzone cost (subgradient in t).
+        envelope_price: the same for the levels of the envelope, in x.
+        limit_price: net price of the CV limits per prediction (high minus low); empty where there are none.
         lower_price, upper_price: multipliers of the limits of x, non-negative.
         row_low_price, row_high_price: multipliers of the hard rows, non-negative.
-        residual: relative duality gap or violation of the hard rows, whichever is larger (`kkt` has more).
+        residual: relative duality gap or violation of the hard rows, whichever is larger.
     """
 
     x: Float[Array, " n"]
@@ -47,8 +50,9 @@ class QpSolution(eqx.Module):
     bound: Float[Array, ""]
     status: Int[Array, ""]
     iterations: Int[Array, ""]
-    row_price: Float[Array, " row"]
-    limit_price: Float[Array, " prediction"]
+    row_price: Float[Array, " prediction"]
+    envelope_price: Float[Array, "level n"]
+    limit_price: Float[Array, " limit"]
     lower_price: Float[Array, " n"]
     upper_price: Float[Array, " n"]
     row_low_price: Float[Array, " hard"]
@@ -61,15 +65,19 @@ class Slopes(NamedTuple):
 
     Attributes:
         level, sharp: of the predictions, see `gram`.
-        envelope: of the rows of the envelope.
-        box: of the limits of x.
+        limit: of the CV limits per prediction; empty where there are none.
+        upper: which of these are upper limits.
+        slack: of eps, upper limits first.
+        move: of every move by itself: limits and envelope.
         hard: of the hard rows.
     """
 
     level: Float[Array, " prediction"]
     sharp: Float[Array, " prediction"]
-    envelope: Float[Array, " envelope"]
-    box: Float[Array, " n"]
+    limit: Float[Array, " limit"]
+    upper: Bool[Array, " limit"]
+    slack: Float[Array, " side"]
+    move: Float[Array, " n"]
     hard: Float[Array, " hard"]
 
 
@@ -77,76 +85,98 @@ class Prepared(eqx.Module):
     """One lane, ready to be solved; objective terms are divided by `unit`.
 
     Attributes:
-        qp, w_matrix, instance, lower, upper: the problem as it was given; `w_matrix` holds the hard rows.
+        qp, instance, lower, upper: the problem as it was given.
         unit: what objectives and prices are divided by.
         hessian, linear: smooth part of the objective.
-        curvature, steepness: 2 S and s per row.
-        soft: rows that have a deadzone cost.
+        curvature, steepness: 2 S and s per prediction.
+        steep: slopes of the envelope.
         free: moves with room between their limits.
         takes_part: hard rows with free moves; the others are constants.
         row_low, row_high: their limits, infinite for the constants.
         limit_low, limit_high: CV limits that cost something, infinite for the others; empty where there are none at all.
+        slack_unit: what one unit of eps is, per CV [CV unit].
+        slack_price: its price, upper and lower sides; empty where there are no limits.
     """
 
     qp: CondensedQp
-    w_matrix: Float[Array, "hard n"]
     instance: QpInstance
     lower: Float[Array, " n"]
     upper: Float[Array, " n"]
     unit: Float[Array, ""]
     hessian: Float[Array, "n n"]
     linear: Float[Array, " n"]
-    curvature: Float[Array, " row"]
-    steepness: Float[Array, " row"]
-    soft: Bool[Array, " row"]
+    curvature: Float[Array, " prediction"]
+    steepness: Float[Array, " prediction"]
+    steep: Float[Array, "level n"]
     free: Bool[Array, " n"]
     takes_part: Bool[Array, " hard"]
     row_low: Float[Array, " hard"]
     row_high: Float[Array, " hard"]
     limit_low: Float[Array, " limit"]
     limit_high: Float[Array, " limit"]
-
-    @property
-    def predictions(self) -> int:
-        """Rows of predictions; those of the envelope follow."""
-        return self.instance.limit_high.shape[0]
+    slack_unit: Float[Array, " cv"]
+    slack_price: Float[Array, " side"]
 
     @property
     def keep(self) -> Float[Array, " n"]:
         """1 for free moves, 0 for fixed ones."""
         return self.free.astype(self.lower.dtype)
 
-    def respond(self, x: Float[Array, " n"]) -> Float[Array, " row"]:
+    def respond(self, x: Float[Array, " n"]) -> Float[Array, " prediction"]:
         """Theta x."""
         return self.qp.response @ (self.qp.scale * x)
 
-    def pull(self, prices: Float[Array, " row"]) -> Float[Array, " n"]:
-        """Theta' prices; the rows may be the predictions alone."""
-        return (prices @ self.qp.response[: prices.shape[0]]) * self.qp.scale
+    def pull(self, prices: Float[Array, " prediction"]) -> Float[Array, " n"]:
+        """Theta' prices."""
+        return (prices @ self.qp.response) * self.qp.scale
 
-    def newton_matrix(self, row, hard, box, ridge) -> Float[Array, "n n"]:
-        """Hessian + theta' diag(row) theta + W' diag(hard) W + diag(box) + ridge; identity on fixed moves."""
-        response = self.qp.response
-        return self._assembled(response.T @ (row[:, None] * response), hard, box, ridge)
+    def by_cv(self, values: Float[Array, " limit"]) -> Float[Array, "cv horizon"]:
+        """Values per prediction, one row per CV; no columns where there are no limits."""
+        return values.reshape(self.qp.slack_weight.shape[0], -1)
 
-    def net(self, row: Float[Array, " row"], limit: Float[Array, " limit"]) -> Float[Array, " row"]:
-        """Prices of the rows with those of the CV limits, which come first among them, added."""
-        return jnp.concatenate([row[: limit.shape[0]] + limit, row[limit.shape[0] :]]) if len(limit) else row
+    def spent(self, limit: Float[Array, " limit"]) -> Float[Array, " side"]:
+        """Sums of the prices of the limits per CV, upper and lower sides."""
+        both = jnp.maximum(jnp.stack([limit, -limit]), 0.0).reshape(2 * self.qp.slack_weight.shape[0], -1)
+        return both @ np.ones(both.shape[1])
 
-    def proximal_matrix(self, slopes: Slopes, ridge) -> Float[Array, "n n"]:
-        """`newton_matrix` for the weights of a proximal Newton step."""
-        qp, predictions = self.qp, self.predictions
+    def given_up(self, slack: Float[Array, " side"]) -> tuple[Array, Array]:
+        """Eps per prediction [CV unit], of the upper and of the lower limits; empty where there are none."""
+        if not self.qp.has_limits:
+            return slack, slack
+        horizon = self.limit_high.shape[0] // self.slack_unit.shape[0]
+        high, low = jnp.split(slack, 2)
+        return jnp.repeat(self.slack_unit * high, horizon), jnp.repeat(self.slack_unit * low, horizon)
+
+    def proximal_matrix(self, slopes: Slopes, ridge) -> Float[Array, "m m"]:
+        """Hessian + theta' diag(..) theta + W' diag(hard) W + diag(move) + ridge, identity on fixed moves; with the rows
+        and columns of eps after those of the moves, where there are CV limits.
+        """
+        qp, keep, scale = self.qp, self.keep, self.qp.scale
         cvs = qp.slack_weight.shape[0]
-        squares = gram(qp.response[:predictions], qp.summed, cvs, slopes.level, slopes.sharp)
-        own = slopes.envelope @ qp.response[predictions:] ** 2  # one move each
-        return self._assembled(squares + jnp.diag(own), slopes.hard, slopes.box, ridge)
+        level, sharp = slopes.level, slopes.sharp
+        if qp.has_limits:
+            many = jnp.sum(slopes.limit > 0.0) > MANY
+            level = level + jnp.where(many, slopes.limit, 0.0)
+            sharp = sharp + jnp.where(many, 0.0, slopes.limit)
+        squares = gram(qp.response, qp.summed, cvs, level, sharp)
+        matrix = self.hessian + scale[:, None] * scale[None, :] * squares + qp.rows.square(slopes.hard)
+        matrix = matrix * keep[:, None] * keep[None, :] + jnp.diag(keep * slopes.move + (1.0 - keep + ridge))
+        if not qp.has_limits:
+            return matrix
+        nothing = jnp.zeros((2 * cvs, scale.shape[0])), jnp.zeros(2 * cvs)
+        any_ = jnp.any(slopes.limit > 0.0)
+        meet, own = jax.lax.cond(any_, lambda: self._slack_products(slopes), lambda: nothing)
+        return jnp.block([[matrix, meet.T], [meet, jnp.diag(own + slopes.slack + ridge)]])
 
-    def _assembled(self, squares, hard, box, ridge):
-        """The Newton matrix, given the squares of the rows in MV units."""
-        keep, scale, w_matrix = self.keep, self.qp.scale, self.w_matrix
-        matrix = self.hessian + scale[:, None] * scale[None, :] * squares
-        matrix += w_matrix.T @ (hard[:, None] * w_matrix)
-        return matrix * keep[:, None] * keep[None, :] + jnp.diag(keep * box + (1.0 - keep + ridge))
+    def _slack_products(self, slopes: Slopes) -> tuple[Float[Array, "side n"], Float[Array, " side"]]:
+        """Products of the active CV limits with their eps: with the moves, and with themselves."""
+        unit, response = jnp.tile(self.slack_unit, 2), self.qp.response
+        limits = self.by_cv(jnp.where(slopes.upper, -slopes.limit, slopes.limit))
+        sides = jnp.concatenate([jnp.minimum(limits, 0.0), jnp.maximum(limits, 0.0)])
+        by_side = sides.reshape(2, *limits.shape)
+        meet = jnp.einsum("scj,cjn->scn", by_side, response.reshape(*limits.shape, -1))
+        meet = meet.reshape(len(unit), -1) * (self.keep * self.qp.scale) * unit[:, None]
+        return meet, jnp.sum(jnp.abs(sides), axis=1) * unit**2
 
     def value(self, x, t) -> Float[Array, ""]:
         """Objective in its own unit at x with t = theta x + t0."""
@@ -154,36 +184,33 @@ class Prepared(eqx.Module):
 
 
 def prepare(
-    qp: CondensedQp,
-    rows: Float[Array, "hard n"] | np.ndarray,
-    instance: QpInstance,
-    lower: Float[Array, " n"],
-    upper: Float[Array, " n"],
+    qp: CondensedQp, instance: QpInstance, lower: Float[Array, " n"], upper: Float[Array, " n"]
 ) -> Prepared:
     """Scale one lane (use `jax.vmap` for a batch).
 
     Args:
         qp: constant part.
-        rows: hard rows, `blocking.hard_rows(structure)`.
         instance: offsets and limits of this sample.
         lower, upper: limits of x; equal limits fix a move.
     """
-    w_matrix = jnp.asarray(rows)
     offset, size = instance.offset, jnp.abs(qp.response)
     linear = 2.0 * ((qp.quadratic * offset) @ qp.response) * qp.scale
     beyond = jnp.maximum(jnp.abs(offset) - qp.deadzone, 0.0)
     steep = jnp.abs(linear) + ((qp.soft_linear + 2.0 * qp.soft_quadratic * beyond) @ size) * qp.scale
+    steep += jnp.sum(qp.steep, axis=0)
     unit = jnp.maximum(jnp.max(jnp.diagonal(qp.curvature) + qp.bend), 1e-2 * jnp.max(steep))
     if qp.has_limits:
         unit = jnp.maximum(unit, 1e-3 * jnp.max(qp.slack_weight * qp.reach))
     unit = jnp.where(unit > 0.0, unit, 1.0)
+    none, slack_unit = jnp.zeros(0), jnp.where(qp.reach > 0.0, qp.reach, 1.0)
+    horizon = instance.limit_high.shape[0] // qp.slack_weight.shape[0]
+    paid = jnp.repeat(qp.slack_weight > 0.0, horizon)
+    price = qp.slack_weight * slack_unit / unit
     free = (upper - lower) > FIXED
     # rows without free moves are constants and leave the solver; feasibility of the whole is checked outside
-    takes_part = (jnp.abs(w_matrix) @ free.astype(lower.dtype)) > 0.0
-    paid = jnp.repeat(qp.slack_weight > 0.0, instance.limit_high.shape[0] // qp.slack_weight.shape[0])
+    takes_part = qp.rows.touch(free.astype(lower.dtype))
     return Prepared(
         qp=qp,
-        w_matrix=w_matrix,
         instance=instance,
         lower=lower,
         upper=upper,
@@ -192,13 +219,15 @@ def prepare(
         linear=linear / unit,
         curvature=2.0 * qp.soft_quadratic / unit,
         steepness=qp.soft_linear / unit,
-        soft=(qp.soft_quadratic + qp.soft_linear) > 0.0,
+        steep=qp.steep / unit,
         free=free,
         takes_part=takes_part,
         row_low=jnp.where(takes_part, instance.row_low, -jnp.inf),
         row_high=jnp.where(takes_part, instance.row_high, jnp.inf),
-        limit_low=jnp.where(paid, instance.limit_low, -jnp.inf) if qp.has_limits else jnp.zeros(0),
-        limit_high=jnp.where(paid, instance.limit_high, jnp.inf) if qp.has_limits else jnp.zeros(0),
+        limit_low=jnp.where(paid, instance.limit_low, -jnp.inf) if qp.has_limits else none,
+        limit_high=jnp.where(paid, instance.limit_high, jnp.inf) if qp.has_limits else none,
+        slack_unit=slack_unit,
+        slack_price=jnp.concatenate([price, price]) if qp.has_limits else none,
     )
 
 
@@ -224,8 +253,8 @@ def evaluate(qp: CondensedQp, instance: QpInstance, x: Float[Array, " n"]) -> Fl
 
 
 def _value(qp: CondensedQp, instance: QpInstance, x, t) -> Float[Array, ""]:
-    rows = total(qp.quadratic * t**2 + _soft_cost(qp, t))
-    return rows + jnp.sum(qp.move_weight * x**2) + jnp.sum(limit_cost(qp, instance, t))
+    own = jnp.sum(qp.move_weight * x**2) + jnp.sum(_envelope_cost(qp, x))
+    return total(qp.quadratic * t**2 + _soft_cost(qp, t)) + own + jnp.sum(limit_cost(qp, instance, t))
 
 
 def total(values: Float[Array, " row"]) -> Float[Array, ""]:
@@ -238,24 +267,28 @@ def _soft_cost(qp: CondensedQp, t):
     return (qp.soft_quadratic * beyond + qp.soft_linear) * beyond
 
 
+def _envelope_cost(qp: CondensedQp, x):
+    return qp.steep * jnp.maximum(jnp.abs(x) - qp.knot, 0.0)
+
+
 def limit_cost(qp: CondensedQp, instance: QpInstance, t):
     """Rho times the largest violation per CV and side, high sides first."""
     if not qp.has_limits:
         return jnp.zeros(1)
     cvs = qp.slack_weight.shape[0]
-    y = t[: instance.limit_high.shape[0]]
-    over = jnp.max((y - instance.limit_high).reshape(cvs, -1), axis=1)
-    under = jnp.max((instance.limit_low - y).reshape(cvs, -1), axis=1)
+    over = jnp.max((t - instance.limit_high).reshape(cvs, -1), axis=1)
+    under = jnp.max((instance.limit_low - t).reshape(cvs, -1), axis=1)
     rho = jnp.concatenate([qp.slack_weight, qp.slack_weight])
     return rho * jnp.maximum(jnp.concatenate([over, under]), 0.0)
 
 
 class Prices(eqx.Module):
-    """Multipliers in the objective's own unit, net of both sides; `limit` may be empty or None where all are zero."""
+    """Multipliers in the objective's own unit, net of both sides; `limit` is empty where there are no CV limits."""
 
-    row: Float[Array, " row"]
+    row: Float[Array, " prediction"]
+    envelope: Float[Array, "level n"]
+    limit: Float[Array, " limit"]
     hard: Float[Array, " hard"]
-    limit: Float[Array, " limit"] | None = None
 
 
 def conclude(
@@ -282,22 +315,21 @@ def conclude(
     price = jnp.where(s2 > 0, prices.row, jnp.clip(prices.row, -s1, s1))
     over = jnp.maximum(jnp.abs(price) - s1, 0.0)
     conjugate = qp.deadzone * jnp.abs(price) + over**2 / jnp.where(s2 > 0, 4.0 * s2, 1.0)
+    envelope = jnp.clip(prices.envelope, -qp.steep, qp.steep)
     # the gap is summed term by term: each is small at a solution, while objective and bound may be large
     found = total(_soft_cost(qp, t) + conjugate - price * t)
-    net, limit_price = price, jnp.zeros_like(instance.limit_high)
+    found += jnp.sum(_envelope_cost(qp, x) + qp.knot * jnp.abs(envelope) - envelope * x)
+    net, limit_price = price, prices.limit
     if qp.has_limits:
-        found += jnp.sum(limit_cost(qp, instance, t))
-    if qp.has_limits and prices.limit is not None:
         limit_price, paid = _limit_terms(qp, instance, t, prices.limit)
-        found -= paid
-        net = problem.net(price, limit_price)
-    wx = x @ problem.w_matrix.T
+        found += jnp.sum(limit_cost(qp, instance, t)) - paid
+        net = price + limit_price
+    wx = qp.rows.of(x)
     row_low, row_high = jnp.maximum(-prices.hard, 0.0), jnp.maximum(prices.hard, 0.0)
     found -= jnp.sum(jnp.where(row_high > 0, row_high * (wx - instance.row_high), 0.0))
     found -= jnp.sum(jnp.where(row_low > 0, row_low * (instance.row_low - wx), 0.0))
-    gradient = (
-        qp.hessian @ x + problem.linear * problem.unit + problem.pull(net) + prices.hard @ problem.w_matrix
-    )
+    gradient = qp.hessian @ x + problem.linear * problem.unit + problem.pull(net)
+    gradient += jnp.sum(envelope, axis=0) + qp.rows.pull(prices.hard)
     # the box of x is not priced but kept: min over the box of gradient'(z - x), curvature left out
     lower, upper = problem.lower, problem.upper
     reach_low = jnp.where(jnp.isfinite(lower), lower, x - 10.0 * (1.0 + jnp.abs(x)))
@@ -315,6 +347,7 @@ def conclude(
         status=jnp.where(good, OPTIMAL, FAILED),
         iterations=iterations,
         row_price=price,
+        envelope_price=envelope,
         limit_price=limit_price,
         lower_price=jnp.maximum(gradient, 0.0),
         upper_price=jnp.maximum(-gradient, 0.0),
@@ -332,7 +365,6 @@ def _limit_terms(qp: CondensedQp, instance: QpInstance, t, price):
     spent = jnp.sum(both, axis=1)
     both = both * jnp.where(spent > rho, rho / jnp.maximum(spent, TINY), 1.0)[:, None]
     high, low = both.reshape(-1)[:predictions], both.reshape(-1)[predictions:]
-    y = t[:predictions]
-    paid = total(jnp.where(high > 0, high * (y - instance.limit_high), 0.0))
-    paid += total(jnp.where(low > 0, low * (instance.limit_low - y), 0.0))
+    paid = total(jnp.where(high > 0, high * (t - instance.limit_high), 0.0))
+    paid += total(jnp.where(low > 0, low * (instance.limit_low - t), 0.0))
     return high - low, paid

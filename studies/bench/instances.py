@@ -19,8 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.controller.case import Case, case_to_dict
-from jaxmpc.controller.continuous import ContinuousController
-from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.controller.controller import Controller
 from jaxmpc.files import write_atomically
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import simulate
@@ -118,11 +117,10 @@ class Instances:
         return body
 
 
-def make_controller(kind: Kind, mode: Mode, model: StepResponseModel) -> Any:
+def make_controller(kind: Kind, mode: Mode, model: StepResponseModel) -> Controller:
     """The controller of the thesis preset."""
     structure = presets.structure(mode, integer=kind == "mixed-integer")
-    maker = MixedIntegerController if kind == "mixed-integer" else ContinuousController
-    return maker(structure, presets.tuning(structure), model)
+    return Controller(structure, presets.tuning(structure), model)
 
 
 class Recordings:
@@ -222,28 +220,29 @@ class Recordings:
         )
 
 
-def replay(controller, recording: Recording) -> Problems:
+def replay(controller: Controller, recording: Recording) -> Problems:
     """The problem of every sample of a recording, without solving any.
 
     Args:
         controller: the one that made the recording.
         recording: its run.
     """
-    memory, structure = controller.memory, controller.structure
+    core, structure = controller.core, controller.structure
     start = controller.init(recording.cv[0], recording.mv_demand[0] - recording.move[0])
-    nothing = jnp.zeros((structure.block_count, structure.mv_count))
+    nothing = jnp.zeros((core.size.blocks, core.size.mvs))
 
     @jax.jit
     def run(state, cvs, moves):
         def sample(state, inputs):
             cv, move = inputs
-            state, free = memory.observe(state, cv)
+            state, free = core.observe(state, cv, jnp.nan, False)
             problem = free, state.mv, state.last_move, state.past_moves
-            return memory.remember(state, move, nothing, state.warm), problem
+            return core.remember(state, nothing.at[0].set(move), state.warm), problem
 
         return jax.lax.scan(sample, state, (cvs, moves))[1]
 
     free, now, last, past = jax.tree.map(np.asarray, run(start, recording.cv, recording.move))
+    free, past = free[:, : structure.prediction_horizon], past[:, -structure.mean_move_window :]
     setpoint = np.broadcast_to(recording.setpoint[:, None, :], free.shape)
     return Problems(free, setpoint, now, last, past)
 

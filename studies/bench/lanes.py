@@ -5,28 +5,27 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.problem.blocking import hard_rows
-from jaxmpc.problem.condense import condense, make_instance
+from jaxmpc.controller.controller import Controller
+from jaxmpc.problem.instance import make_instance
 from jaxmpc.relaxed.newton import warm_start_of
 from jaxmpc.relaxed.problem import QpSolution
 from jaxmpc.relaxed.solve import cold_start, shifted_start, solve_relaxed
 from studies.bench.instances import Instances, Problems
 
 
-@eqx.filter_jit
-def _solve_one(rows, qp, instance, start) -> QpSolution:
-    return solve_relaxed(qp, rows, instance, instance.lower, instance.upper, start)
+@jax.jit
+def _solve_one(qp, instance, start) -> QpSolution:
+    return solve_relaxed(qp, instance, instance.lower, instance.upper, start)
 
 
-@eqx.filter_jit
-def _solve_many(rows, qp, instances, starts) -> QpSolution:
+@jax.jit
+def _solve_many(qp, instances, starts) -> QpSolution:
     def lane(instance, start):
-        return solve_relaxed(qp, rows, instance, instance.lower, instance.upper, start)
+        return solve_relaxed(qp, instance, instance.lower, instance.upper, start)
 
     return jax.vmap(lane)(instances, starts)
 
@@ -39,23 +38,26 @@ class Lanes:
     """
 
     def __init__(self, instances: Instances):
-        self.structure, self.tuning = instances.structure, instances.tuning
-        make = functools.partial(
-            condense, self.structure, self.tuning, instances.model.coefficients, envelope=0
-        )
-        self.qp = make()
-        self.rows = hard_rows(self.structure)
+        self.structure = instances.structure
+        self.core = Controller(instances.structure, instances.tuning, instances.model).core
+        self.qp = self.core.qp
         self.instances = self._build(instances.now)
-        predictions = self.structure.cv_count * self.structure.horizon_count
-        self.cold: Any = self._repeat(cold_start(self.qp, len(self.rows), predictions), len(instances))
+        self.cold: Any = jax.jit(jax.vmap(lambda instance: cold_start(self.qp, instance)))(self.instances)
         self._before = instances.before
 
     def _build(self, problems: Problems):
+        core = self.core
+        free, setpoint, now, last, past = (np.asarray(values) for values in problems)
+        more = core.size.future - free.shape[1]
+        whole = lambda v: np.concatenate([v, np.repeat(v[:, -1:], more, axis=1)], axis=1)  # noqa: E731
+        past = np.pad(past, ((0, 0), (core.size.past - past.shape[1], 0), (0, 0)))
+
         def one(free, setpoint, now, last, past):
             return make_instance(
-                self.structure,
-                self.tuning,
-                self.qp,
+                core.layout,
+                core.size,
+                core.tuning,
+                core.qp,
                 free_response=free,
                 setpoint=setpoint,
                 mv_now=now,
@@ -64,20 +66,15 @@ class Lanes:
                 recover=True,
             )
 
-        return jax.jit(jax.vmap(one))(*(jnp.asarray(values) for values in problems))
-
-    def _repeat(self, tree, count: int):
-        return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], count, axis=0), tree)
+        return jax.jit(jax.vmap(one))(whole(free), whole(setpoint), now, last, past)
 
     @functools.cached_property
     def warm(self) -> Any:
         """Where a controller would start: the solution one sample earlier, shifted."""
         earlier = self._singles(self._build(self._before), self.cold)
-        found = [_solve_one(self.rows, self.qp, *single) for single in earlier]
+        found = [_solve_one(self.qp, *single) for single in earlier]
         solutions = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
-        shift = functools.partial(
-            shifted_start, cvs=self.structure.cv_count, horizon=self.structure.horizon_count
-        )
+        shift = functools.partial(shifted_start, cvs=self.structure.cv_count)
         return jax.jit(jax.vmap(lambda solution: shift(warm_start_of(solution))))(solutions)
 
     def singles(self, start) -> list[tuple[Any, Any]]:
@@ -92,7 +89,7 @@ class Lanes:
 
     def solve_single(self, single: tuple[Any, Any]) -> QpSolution:
         """Solve one of `singles`; blocks until it is done."""
-        return jax.block_until_ready(_solve_one(self.rows, self.qp, *single))
+        return jax.block_until_ready(_solve_one(self.qp, *single))
 
     def batch(self, start, count: int) -> tuple[Any, Any]:
         """Problems and starts of a batch of any size; lanes are repeated where there are fewer."""
@@ -103,9 +100,10 @@ class Lanes:
 
     def solve_batch(self, batch: tuple[Any, Any]) -> QpSolution:
         """Solve a batch in one call; blocks until it is done."""
-        return jax.block_until_ready(_solve_many(self.rows, self.qp, *batch))
+        return jax.block_until_ready(_solve_many(self.qp, *batch))
 
     def plans(self, x) -> list[np.ndarray]:
         """Plans ``"block mv"`` [MV unit] of solutions ``"lane n"``."""
         scaled = np.asarray(x) * np.asarray(self.qp.scale)
-        return [row.reshape(self.structure.mv_count, -1).T for row in scaled]
+        blocks = self.structure.block_count
+        return [row.reshape(self.structure.mv_count, -1).T[:blocks] for row in scaled]

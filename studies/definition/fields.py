@@ -13,8 +13,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from jaxmpc.check import LARGEST
 from jaxmpc.errors import InputError, near
-from jaxmpc.problem.declared import LARGEST, declared
+from jaxmpc.problem.declared import declared
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS, WellParameters

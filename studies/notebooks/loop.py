@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from jaxmpc.controller.continuous import ContinuousController
-from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import simulate
@@ -248,10 +247,9 @@ def run(settings: Settings, progress: Progress | None = None) -> ExploreRun:
     begin = time.perf_counter()
     structure, tuning, reference = settings.structure, settings.tuning, settings.reference
     model = model_at(float(settings.model_choke), float(settings.model_lift))
-    kind, actuator = CONTROLLERS[settings.controller]
-    make = MixedIntegerController if kind == "mixed-integer" else ContinuousController
+    _, actuator = CONTROLLERS[settings.controller]
     trajectory = simulate(
-        make(structure, tuning, model),
+        Controller(structure, tuning, model),
         WellPlant(actuator=actuator),  # type: ignore[arg-type]
         reference,
         disturbance=settings.offsets,

@@ -19,16 +19,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.controller.batch import Lanes, controller_batch
-from jaxmpc.controller.mixed_integer import MixedIntegerControllers
+from jaxmpc.controller.controller import Controllers
 from jaxmpc.files import strict_json
-from jaxmpc.integer.relaxer import forget_programs
 from jaxmpc.loop.simulate import simulate_batches
 from jaxmpc.loop.trajectory import TrajectoryBatch
 from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.problem.layout import Size
 from jaxmpc.problem.tuning import stack_tunings
 from jaxmpc.process.plant import WellPlant
 from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS
+from jaxmpc.programs.lanes import Lanes
 from studies.definition.models import Point, identify_models
 from studies.definition.scenarios import Scenario, Study
 from studies.kpi.objectives import THESIS_DEADZONE
@@ -83,11 +83,12 @@ def run_chunk(prepared: PreparedStudy, index: int) -> ChunkResult:
     study = prepared.study
     chunk = study.chunks[index]
     group, lanes = study.groups[chunk.group], study.lanes(chunk.group)
-    own = group.kind, group.actuator, group.structure, group.samples, group.has_limits, group.whole_steps
+    size = Size.of(group.structure, max(model.samples for model in prepared.models.values()))
+    own = group.kind, group.actuator, size, group.samples, group.has_limits, group.whole_steps
     program = *own, group.switching, lanes
     if _program_before != [program]:
         if _program_before:
-            forget_programs()  # those of a dozen groups do not fit side by side
+            jax.clear_caches()  # those of a dozen groups do not fit side by side
         _program_before[:] = [program]
     fields, facts = run_scenarios(
         [study.scenario(int(k)) for k in chunk.scenarios],
@@ -132,14 +133,8 @@ def run_scenarios(
     filled = [*scenarios, *([scenarios[-1]] * (lanes - len(scenarios)))]
     first = filled[0]
     tunings = [s.tuning for s in filled]
-    stacked = stack_tunings(tunings)
     model = [models[first.model_point]] if shared_model else [models[s.model_point] for s in filled]
-    controllers: Any
-    if first.kind == "mixed-integer":
-        controllers = MixedIntegerControllers(first.structure, tunings, model, count=lanes)
-    else:
-        shared = model[0] if shared_model else model
-        controllers = controller_batch(first.structure, stacked, shared)
+    controllers = Controllers(first.structure, tunings, model, count=lanes)
     references = [s.reference for s in filled]
     disturbed = any(s.disturbance is not None for s in filled)
     noisy = any(s.noise is not None for s in filled)
@@ -168,7 +163,7 @@ def run_scenarios(
     (batch,) = batches
     simulated = time.perf_counter()
     windows = np.stack([s.reference.window(s.structure.dt, s.samples) for s in filled])
-    figures = batch_kpis(batch, stacked, windows, tolerance=np.array(SETTLED))
+    figures = batch_kpis(batch, stack_tunings(tunings), windows, tolerance=np.array(SETTLED))
     fields = {name: values[: len(scenarios)] for name, values in figures.items()}
     fields[FLAG] = fields["finite"].astype("i1")
     for field in trajectories:

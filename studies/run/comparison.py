@@ -20,9 +20,8 @@ import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
-from jaxmpc.controller.continuous import ContinuousController
-from jaxmpc.controller.mixed_integer import MixedIntegerController
-from jaxmpc.controller.schedule import ModelSchedule, ScheduledController, ScheduledMixedIntegerController
+from jaxmpc.controller.controller import Controller
+from jaxmpc.controller.schedule import ModelSchedule, ScheduledController
 from jaxmpc.errors import InputError
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.trajectory import Trajectory
@@ -179,18 +178,12 @@ def run_controller(
     """
     structure = definition.structure()
 
-    def controller(tuning: Tuning) -> ContinuousController | MixedIntegerController:
+    def controller(tuning: Tuning) -> Controller:
         if definition.schedule:
             if schedule is None:
                 raise InputError("schedule", None, f"a gain schedule for {definition.name}")
-            if definition.kind == "continuous":
-                return ScheduledController(structure, tuning, schedule)
-            return ScheduledMixedIntegerController(
-                structure, tuning, schedule, time_limit=definition.time_limit
-            )
-        if definition.kind == "continuous":
-            return ContinuousController(structure, tuning, model)
-        return MixedIntegerController(structure, tuning, model, time_limit=definition.time_limit)
+            return ScheduledController(structure, tuning, schedule, time_limit=definition.time_limit)
+        return Controller(structure, tuning, model, time_limit=definition.time_limit)
 
     plant = make_plant(definition.actuator)
     with progress_bar(definition.label, progress) as report, closing(plant):

@@ -17,11 +17,12 @@ import xarray as xr
 
 from identify.steady_map import steady_map
 from identify.step_test import identify_step_response
-from jaxmpc.controller.mixed_integer import MixedIntegerController
-from jaxmpc.controller.targets import TargetController, simulate_with_targets
+from jaxmpc.controller.controller import Controller
+from jaxmpc.controller.targets import TargetController
 from jaxmpc.files import write_atomically
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import Progress, simulate
+from jaxmpc.loop.targets import simulate_with_targets
 from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure
@@ -120,9 +121,7 @@ def run_rto(
 
         def close(name: str, well: Any, report: Progress | None) -> Trajectory:
             if name == WITHOUT:
-                return simulate(
-                    MixedIntegerController(structure, tuning, model), well, demanded, progress=report
-                )
+                return simulate(Controller(structure, tuning, model), well, demanded, progress=report)
             setpoints, ideal = (
                 Reference(demanded.times, [getattr(each, key) for each in found], demanded.duration)
                 for key in ("cv", "mv")

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from jaxmpc.controller.continuous import ControllerState, Memory
-from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.controller.controller import Controller
+from jaxmpc.controller.core import ControllerState, Core
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.status import LIMIT
 from studies.definition.comparison import ControllerDefinition
@@ -75,22 +75,25 @@ def objective_loss(
         model: its prediction model, ``model.json`` in the folder of the study.
     """
     run = data.sel(controller=definition.name).load()
-    exact = MixedIntegerController(definition.structure(), definition.build_tuning(), model)
+    exact = Controller(definition.structure(), definition.build_tuning(), model)
     cv, setpoint, move = run.measurement.values, run.setpoint.values, run.move.values
-    plan = run.plan.values[:, : definition.structure().block_count]
+    blocks = definition.structure().block_count
+    plan = np.zeros((len(cv), *exact.core.layout.length.shape, move.shape[1]))
+    plan[:, :blocks] = run.plan.values[:, :blocks]
+    plan[:, 0] = move
     status, objective = run.status.values, run.objective.values
     loss = np.where(np.isfinite(objective), 0.0, np.nan)
-    state, memory = exact.init(cv[0], run.demand.values[0] - move[0]), exact.memory
+    state = exact.init(cv[0], run.demand.values[0] - move[0])
     for k in range(len(cv)):
         if status[k] == LIMIT and np.isfinite(objective[k]):
             best = float(exact.step(state, cv[k], setpoint[k])[1].objective)
             loss[k] = max(objective[k] / best - 1.0, 0.0)
-        state = _replayed(memory, state, cv[k], move[k], plan[k])
+        state = jax.tree.map(np.asarray, _replayed(exact.core, state, cv[k], plan[k]))
     return loss
 
 
 @jax.jit
-def _replayed(memory: Memory, state: ControllerState, cv, move, plan) -> ControllerState:
-    """The state one sample later, for a move that was made."""
-    state, _ = memory.observe(state, jnp.asarray(cv))
-    return memory.remember(state, move, plan, state.warm)
+def _replayed(core: Core, state: ControllerState, cv, plan) -> ControllerState:
+    """The state one sample later, for a plan whose first move was made."""
+    state, _ = core.observe(state, jnp.asarray(cv), jnp.nan, False)
+    return core.remember(state, plan, state.warm)

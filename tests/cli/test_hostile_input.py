@@ -14,6 +14,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from jaxmpc.check import LARGEST
 from jaxmpc.cli.main import main
 from jaxmpc.controller.case import make_case
 from jaxmpc.errors import InputError
@@ -23,7 +24,7 @@ from jaxmpc.integer.lower_bound import LowerModel, enumerate_below
 from jaxmpc.integer.outer_approximation import outer_approximation
 from jaxmpc.integer.solve import FINISHES
 from jaxmpc.problem.memory import BUDGET, check_ranges, check_size
-from jaxmpc.problem.structure import LARGEST, Structure
+from jaxmpc.problem.structure import Structure
 from tests import problems
 
 MOST_MEMORY = 2 * 2**30  # bytes that the process may grow by, compiled programs included

@@ -8,19 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmpc.controller.batch import (
-    Lanes,
-    build_lanes,
-    controller_batch,
-    for_all,
-    map_lanes,
-    per_lane,
-    place,
-    variant_mesh,
-)
-from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.sample import Sample
 from jaxmpc.errors import InputError
-from jaxmpc.problem.tuning import make_tuning, stack_tunings
+from jaxmpc.problem.tuning import make_tuning
+from jaxmpc.programs.lanes import Lanes, for_all, lanes_of, map_lanes, per_lane, place, variant_mesh
 
 
 @pytest.fixture(scope="module")
@@ -55,80 +47,77 @@ def assert_same(one, other):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
+def alone(structure, tuning, model, *, summed):
+    """What compiled programs know of a controller by itself."""
+    core = Controller(structure, tuning, model).core
+    return core if summed else eqx.tree_at(lambda c: c.qp.summed, core, None)
+
+
 def test_tunings_share_the_matrices_of_the_model(structure, tunings, well_like_model):
-    lanes = controller_batch(structure, tunings, well_like_model)
-    assert lanes.count == 3
-    assert lanes.each.memory.coefficients is None
-    assert lanes.each.qp.summed is None
-    assert lanes.shared.qp.summed is not None
-    theirs = {leaf.shape[0] for leaf in jax.tree.leaves(lanes.each)}
+    lanes = Controllers(structure, tunings, well_like_model)
+    cores = lanes.cores
+    assert lanes.count == cores.count == 3
+    assert cores.each.coefficients is None
+    assert cores.each.qp.summed is None
+    assert cores.shared.qp.summed is not None
+    theirs = {leaf.shape[0] for leaf in jax.tree.leaves(cores.each)}
     assert theirs == {3}
     rows = structure.cv_count * structure.horizon_count
     # nothing with rows times moves numbers has a lane axis
-    assert max(leaf[0].size for leaf in jax.tree.leaves(lanes.each)) < rows * 12
+    assert max(leaf[0].size for leaf in jax.tree.leaves(cores.each)) < rows * 12
     for k, tuning in enumerate(tunings):
-        assert_same(lanes.lane(k), ContinuousController(structure, tuning, well_like_model, summed=True))
-
-
-def test_stacked_tunings_are_a_list_of_tunings(structure, tunings, well_like_model):
-    lanes = controller_batch(structure, tunings, well_like_model)
-    assert_same(lanes, controller_batch(structure, stack_tunings(tunings), well_like_model))
+        assert_same(cores.lane(k), alone(structure, tuning, well_like_model, summed=True))
 
 
 def test_models_may_have_lanes(structure, tunings, models):
-    lanes = controller_batch(structure, tunings, models)
-    assert lanes.shared.memory.coefficients is None
-    assert lanes.value.qp.summed is None
+    cores = Controllers(structure, tunings, models).cores
+    assert cores.shared.coefficients is None
+    assert cores.value.qp.summed is None
     for k in range(3):
-        assert_same(lanes.lane(k), ContinuousController(structure, tunings[k], models[k], summed=False))
-    stacked = eqx.tree_at(lambda m: m.coefficients, models[0], jnp.stack([m.coefficients for m in models]))
-    assert_same(lanes, controller_batch(structure, tunings, stacked))
-    one_tuning = controller_batch(structure, tunings[1], models)
+        assert_same(cores.lane(k), alone(structure, tunings[k], models[k], summed=False))
+    one_tuning = Controllers(structure, tunings[1], models).cores
     assert one_tuning.each.tuning.cv_weight is None
-    assert_same(one_tuning.lane(2), ContinuousController(structure, tunings[1], models[2], summed=False))
+    assert_same(one_tuning.lane(2), alone(structure, tunings[1], models[2], summed=False))
 
 
 def test_value_and_axes_are_what_vmap_takes(structure, tunings, well_like_model):
-    lanes = controller_batch(structure, tunings, well_like_model)
-    cv, mv, setpoint = (
-        jnp.asarray([11000.0, 185.0]),
-        jnp.asarray([50.0, 7500.0]),
-        jnp.asarray([12000.0, 180.0]),
-    )
-    one = lambda controller: controller.step(controller.init(cv, mv), cv, setpoint)[1].moves  # noqa: E731
-    together = eqx.filter_jit(eqx.filter_vmap(one, in_axes=(lanes.axes,)))(lanes.value)
-    for k in range(3):
-        np.testing.assert_allclose(together[k], eqx.filter_jit(one)(lanes.lane(k)), rtol=1e-5, atol=1e-6)
+    cores = Controllers(structure, tunings, well_like_model).cores
+    cv, mv, setpoint = np.array([11000.0, 185.0]), np.array([50.0, 7500.0]), np.array([12000.0, 180.0])
+    rows = np.tile(setpoint, (cores.shared.size.future, 1))
+    sample = Sample(cv, rows, np.full(2, np.nan), np.zeros(2, dtype=bool))
+    one = lambda core: core.conclude(core.consider(core.init(cv, mv), sample, 1e-6))[1].moves  # noqa: E731
+    together = jax.jit(jax.vmap(one, in_axes=(cores.axes,)))(cores.value)
+    for k, tuning in enumerate(tunings):
+        controller = Controller(structure, tuning, well_like_model)
+        own = controller.step(controller.init(cv, mv), cv, setpoint)[1].moves
+        np.testing.assert_allclose(together[k, : len(own)], own, rtol=1e-5, atol=1e-6)
+        np.testing.assert_array_equal(together[k, len(own) :], 0.0)  # padding
 
 
 @pytest.mark.parametrize(
     ("change", "field"),
     [
         (lambda t, m: ([], m[0]), "tunings"),
-        (lambda t, m: (t[0], m[0]), "tunings"),
         (lambda t, m: (t[:2], m), "tunings"),
-        (lambda t, m: (t, []), "model"),
-        (lambda t, m: (t, [m[0], dataclasses.replace(m[1], dt=5.0), m[2]]), "model[1]"),
+        (lambda t, m: (t, []), "models"),
+        (lambda t, m: (t, [m[0], dataclasses.replace(m[1], dt=5.0), m[2]]), "model[1].dt"),
     ],
 )
 def test_lanes_that_do_not_fit_are_refused(structure, tunings, models, change, field):
     with pytest.raises(InputError) as error:
-        controller_batch(structure, *change(tunings, models))
+        Controllers(structure, *change(tunings, models))
     assert error.value.field == field
 
 
-def test_only_what_depends_on_the_argument_gets_lanes():
-    constant = jnp.arange(3.0)
-
-    def build(given):
-        return {"own": given * constant, "common": constant**2, "name": "static", "nested": (given, 2.0)}
-
-    lanes = build_lanes(build, jnp.asarray([1.0, 2.0]), 2)
-    assert lanes.each["common"] is None
-    assert lanes.shared["name"] == "static"
+def test_several_trees_are_lanes_and_a_single_one_is_shared():
+    trees = [{"own": k * jnp.arange(3.0), "nested": (np.asarray(k), None)} for k in (1.0, 2.0)]
+    lanes = lanes_of(trees)
+    assert lanes.count == 2
     np.testing.assert_array_equal(lanes.value["own"], [[0, 1, 2], [0, 2, 4]])
-    np.testing.assert_array_equal(lanes.shared["common"], [0, 1, 4])
-    assert lanes.lane(1)["nested"] == (2.0, 2.0)
+    assert lanes.lane(1)["nested"] == (2.0, None)
+    alone = lanes_of(trees[:1])
+    assert alone.count is None
+    assert alone.shared is trees[0]
 
 
 def test_lanes_of_different_counts_are_refused():

@@ -120,7 +120,7 @@ def changed(body, *path_and_value):
         (("options", "gap", 2.0), "gap"),
         (("state", "future", [[0.0], [0.0]]), r"controller\.state\.future"),
         (("state", "warm.x", None), r"controller\.state\.warm\.x"),
-        (("state", "warm.z", [1.0]), r"controller\.state\.warm\.z"),
+        (("state", "warm.box_price", [1.0]), r"controller\.state\.warm\.box_price"),
         (("state", "mv", ["many", 1.0]), r"controller\.state\.mv"),
     ],
 )

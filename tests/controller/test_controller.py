@@ -8,10 +8,10 @@ import pytest
 
 from jaxmpc import status
 from jaxmpc.controller.bias import filter_bias
-from jaxmpc.controller.continuous import ContinuousController, shift_plan
-from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import make_model
+from jaxmpc.problem.layout import Size, layout_of
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import make_tuning
 
@@ -45,7 +45,7 @@ def run(controller, plant, setpoint, samples):
 
 
 def test_without_model_error_the_bias_stays_zero(well_like_model, small_structure, small_tuning):
-    controller = MixedIntegerController(small_structure, small_tuning, well_like_model)
+    controller = Controller(small_structure, small_tuning, well_like_model)
     infos, _, states = run(
         controller, LinearPlant(well_like_model), [13500.0, 215.0], 70
     )  # longer than N = 60
@@ -54,7 +54,7 @@ def test_without_model_error_the_bias_stays_zero(well_like_model, small_structur
 
 
 def test_a_constant_disturbance_becomes_the_bias(well_like_model, small_structure, small_tuning):
-    controller = MixedIntegerController(small_structure, small_tuning, well_like_model)
+    controller = Controller(small_structure, small_tuning, well_like_model)
     _, _, states = run(controller, LinearPlant(well_like_model, (200.0, -3.0)), START[0], 60)
     np.testing.assert_allclose(np.asarray(states[-1].bias), [200.0, -3.0], rtol=1e-6)
 
@@ -73,7 +73,7 @@ def test_whole_moves_never_reverse_at_once_and_stay_on_the_step(
     light = make_tuning(
         small_structure, **(thesis_fields | {"move_weight": [1.0, 0.2]}), oscillation_rows={"choke": True}
     )
-    controller = MixedIntegerController(small_structure, light, well_like_model)
+    controller = Controller(small_structure, light, well_like_model)
     wrong_gain = dataclasses.replace(well_like_model, coefficients=well_like_model.coefficients * 3.0)
     infos, _, _ = run(controller, LinearPlant(wrong_gain), [11700.0, 197.0], 80)
     steps = np.array([info.move[0] for info in infos]) / 2.0
@@ -87,9 +87,7 @@ def test_the_reactive_limit_stops_the_choke_once_its_mean_move_exceeds_it(
     well_like_model, small_structure, thesis_fields
 ):
     fields = thesis_fields | {"mean_move_limit": [0.55, np.inf], "move_weight": [1.0, 0.2]}
-    controller = MixedIntegerController(
-        small_structure, make_tuning(small_structure, **fields), well_like_model
-    )
+    controller = Controller(small_structure, make_tuning(small_structure, **fields), well_like_model)
     infos, _, _ = run(controller, LinearPlant(well_like_model), [14000.0, 230.0], 60)
     moves = np.array([info.move[0] for info in infos])
     windows = np.array([moves[max(0, k - 25) : k].sum() / 25 for k in range(60)])  # before each decision
@@ -103,7 +101,7 @@ def test_the_predictive_limit_never_lets_the_mean_move_exceed_it(
 ):
     structure = dataclasses.replace(small_structure, mean_move_mode="predictive")
     fields = thesis_fields | {"mean_move_limit": [0.55, 50.0], "move_weight": [1.0, 0.2]}
-    controller = MixedIntegerController(structure, make_tuning(structure, **fields), well_like_model)
+    controller = Controller(structure, make_tuning(structure, **fields), well_like_model)
     infos, _, _ = run(controller, LinearPlant(well_like_model), [14000.0, 230.0], 40)
     assert all(info.status == status.OPTIMAL for info in infos)
     moves = np.array([info.move for info in infos])
@@ -116,9 +114,7 @@ def test_the_predictive_limit_never_lets_the_mean_move_exceed_it(
 
 def test_an_infeasible_problem_holds_the_mvs(well_like_model, small_structure, thesis_fields):
     fields = thesis_fields | {"move_low": [2.0, -200.0], "mv_high": [51.0, 10000.0]}  # must open, may not
-    controller = MixedIntegerController(
-        small_structure, make_tuning(small_structure, **fields), well_like_model
-    )
+    controller = Controller(small_structure, make_tuning(small_structure, **fields), well_like_model)
     _, info = controller.step(controller.init(*START), START[0], START[0])
     assert bool(info.fallback)
     assert int(info.status) == status.INFEASIBLE
@@ -129,11 +125,11 @@ def test_an_infeasible_problem_holds_the_mvs(well_like_model, small_structure, t
 def test_an_mv_outside_its_limits_is_brought_back(
     well_like_model, small_structure, small_tuning, thesis_fields, kind
 ):
+    structure, tuning = small_structure, small_tuning
     if kind == "continuous":
-        relaxed = small_structure.relaxed()
-        controller = ContinuousController(relaxed, make_tuning(relaxed, **thesis_fields), well_like_model)
-    else:
-        controller = MixedIntegerController(small_structure, small_tuning, well_like_model)
+        structure = small_structure.relaxed()
+        tuning = make_tuning(structure, **thesis_fields)
+    controller = Controller(structure, tuning, well_like_model)
     state = controller.init(START[0], np.array([105.0, 10500.0]))
     for k in range(4):
         state, info = controller.step(state, START[0], np.array([15000.0, 230.0]))
@@ -152,35 +148,30 @@ def test_a_batch_of_controllers_does_what_each_does_alone(well_like_model, small
 
     def first_move(weight):
         tuning = eqx.tree_at(lambda t: t.move_weight, make_tuning(relaxed, **thesis_fields), weight)
-        controller = ContinuousController(relaxed, tuning, well_like_model)
+        controller = Controller(relaxed, tuning, well_like_model)
         _, info = controller.step(controller.init(*START), START[0], jnp.asarray([11800.0, 199.0]))
         return info.move, info.objective
 
     together = jax.vmap(first_move)(weights)
     for lane, weight in enumerate(weights):
         alone = first_move(weight)
-        # interior-point iterates of the two programs differ in rounding; both end within 1e-9 of the optimum
+        # the two programs differ in rounding; both end within 1e-9 of the optimum
         np.testing.assert_allclose(together[1][lane], alone[1], rtol=1e-8)
         np.testing.assert_allclose(together[0][lane], alone[0], atol=1e-3)
 
 
 def test_a_shifted_plan_keeps_the_remaining_moves():
     s = Structure(("y",), ("u",), prediction_horizon=9, control_horizon=7, blocks=(1, 1, 2, 3))
-    moves = np.array([[5.0], [3.0], [2.0], [1.0]])  # samples 5 3 2 2 1 1 1
-    np.testing.assert_allclose(
-        shift_plan(s, moves)[:, 0], [3.0, 2.0, 1.5, 2 / 3]
-    )  # 3 2 2 1 1 1 0 averaged in blocks
+    moves = np.array([5.0, 3.0, 2.0, 1.0])  # samples 5 3 2 2 1 1 1
+    shifted = lambda s: layout_of(s, Size.of(s, 9)).shift @ moves  # noqa: E731
+    np.testing.assert_allclose(shifted(s), [3.0, 2.0, 1.5, 2 / 3])  # 3 2 2 1 1 1 0 averaged in blocks
     s = dataclasses.replace(s, blocking="inputs")  # samples 5 3 2 0 1 0 0
-    np.testing.assert_allclose(shift_plan(s, moves)[:, 0], [3.0, 2.0, 1.0, 0.0])
+    np.testing.assert_allclose(shifted(s), [3.0, 2.0, 1.0, 0.0])
 
 
-def test_wrong_controllers_and_models_are_refused(well_like_model, small_structure, small_tuning):
-    with pytest.raises(InputError, match="integer_step"):
-        ContinuousController(small_structure, small_tuning, well_like_model)
-    with pytest.raises(InputError, match="integer_step"):
-        MixedIntegerController(small_structure.relaxed(), small_tuning, well_like_model)
+def test_wrong_models_are_refused(well_like_model, small_structure, small_tuning):
     with pytest.raises(InputError, match=r"model\.dt"):
-        MixedIntegerController(small_structure, small_tuning, dataclasses.replace(well_like_model, dt=5.0))
+        Controller(small_structure, small_tuning, dataclasses.replace(well_like_model, dt=5.0))
     other = make_model(np.ones((1, 2, 3)), 10.0, ["gas"], ["choke", "lift"])
     with pytest.raises(InputError, match=r"model\.cv"):
-        MixedIntegerController(small_structure, small_tuning, other)
+        Controller(small_structure, small_tuning, other)

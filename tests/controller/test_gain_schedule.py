@@ -10,13 +10,10 @@ import numpy as np
 import pytest
 
 from jaxmpc import status
-from jaxmpc.controller.batch import build_lanes
-from jaxmpc.controller.continuous import ContinuousController
-from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.schedule import (
     ModelSchedule,
     ScheduledController,
-    ScheduledMixedIntegerController,
     make_schedule,
 )
 from jaxmpc.errors import InputError
@@ -24,7 +21,6 @@ from jaxmpc.problem.tuning import make_tuning, stack_tunings
 
 CHOKES, LIFTS = (10.0, 30.0, 50.0), (5000.0, 7500.0)
 AT = np.array([11000.0, 185.0]), np.array([50.0, 7500.0])  # CVs, MVs
-STEP = eqx.filter_jit(lambda controller, *arguments: controller.step(*arguments))
 
 
 def models_of(base, factor):
@@ -59,13 +55,13 @@ def near(expected, **tolerance):
 
 def continuous_of(structure, fields, made_with):
     fields = {key: value for key, value in fields.items() if key != "oscillation_rows"}
-    kind = ScheduledController if isinstance(made_with, ModelSchedule) else ContinuousController
+    kind = ScheduledController if isinstance(made_with, ModelSchedule) else Controller
     shape = structure.relaxed()
     return kind(shape, make_tuning(shape, **fields), made_with)
 
 
 def integer_of(structure, fields, made_with):
-    kind = ScheduledMixedIntegerController if isinstance(made_with, ModelSchedule) else MixedIntegerController
+    kind = ScheduledController if isinstance(made_with, ModelSchedule) else Controller
     return kind(
         structure, make_tuning(structure, **({"oscillation_rows": {"choke": True}} | fields)), made_with
     )
@@ -74,19 +70,12 @@ def integer_of(structure, fields, made_with):
 BOTH = pytest.mark.parametrize("make", [continuous_of, integer_of], ids=["continuous", "mixed-integer"])
 
 
-def step(controller, *arguments):
-    """One sample, compiled where the controller can be."""
-    if isinstance(controller, MixedIntegerController):
-        return controller.step(*arguments)
-    return STEP(controller, *arguments)
-
-
 def run(controller, samples=12):
     """Samples against measurements that do not depend on the moves, with a setpoint that asks for large ones."""
     state, infos = controller.init(*AT), []
     for k in range(samples):
         measured = AT[0] + np.array([150.0, -2.0]) * np.sin(0.5 * k)
-        state, info = step(controller, state, measured, AT[0] + np.array([-2500.0, -40.0]))
+        state, info = controller.step(state, measured, AT[0] + np.array([-2500.0, -40.0]))
         infos.append(info)
     return state, jax.tree.map(lambda *leaves: np.stack(leaves), *infos)
 
@@ -189,7 +178,7 @@ def test_a_change_of_model_at_rest_gives_no_move(make, varied, small_structure, 
     state = controller.init(*AT)
     for choke in (50.0, 40.0, 22.0, 10.0):  # another model each time
         state = eqx.tree_at(lambda s: s.mv, state, np.array([choke, 6000.0]))
-        state, info = step(controller, state, AT[0], AT[0])
+        state, info = controller.step(state, AT[0], AT[0])
         assert not info.fallback
         assert info.moves == near(np.zeros_like(info.moves), abs=1e-6)
         assert state.bias == near(np.zeros(2), abs=1e-9)
@@ -202,7 +191,7 @@ def test_what_past_moves_will_still_do_does_not_change_with_the_model(
     controller = make(small_structure, thesis_fields, varied)
     state, _ = run(controller, 3)
     other = eqx.tree_at(lambda s: s.mv, state, np.array([10.0, 5000.0]))
-    after, info = step(controller, other, AT[0], AT[0] - np.array([2000.0, 60.0]))
+    after, info = controller.step(other, AT[0], AT[0] - np.array([2000.0, 60.0]))
     before = np.asarray(state.future)
     shifted = np.concatenate([before[:, 1:], before[:, -1:]], axis=1)
     used = varied.model_at(np.asarray(other.mv) + 0.5 * np.asarray(info.move))
@@ -219,7 +208,7 @@ def test_a_prediction_error_goes_into_the_bias_after_a_change_of_model(
     state, _ = run(controller, 3)
     moved = eqx.tree_at(lambda s: s.mv, state, np.array([12.0, 5500.0]))
     expected = np.asarray(state.base) + np.asarray(state.future)[:, 0]
-    after, _ = step(controller, moved, expected + np.array([70.0, -3.0]), AT[0])
+    after, _ = controller.step(moved, expected + np.array([70.0, -3.0]), AT[0])
     assert after.bias_raw == near([70.0, -3.0], abs=1e-6)
 
 
@@ -228,9 +217,9 @@ def test_a_step_and_the_step_back_leave_nothing_behind(make, varied, small_struc
     free = {"oscillation_rows": {"choke": False}}
     one_way = lambda by: thesis_fields | free | {"move_low": [by, 0.0], "move_high": [by, 0.0]}  # noqa: E731
     up, down = (make(small_structure, one_way(by), varied) for by in (2.0, -2.0))
-    state, first = step(up, up.init(AT[0], np.array([44.0, 7500.0])), AT[0], AT[0])
+    state, first = up.step(up.init(AT[0], np.array([44.0, 7500.0])), AT[0], AT[0])
     assert np.abs(np.asarray(state.future)[:, -1]).min() > 0.5
-    state, back = step(down, state, AT[0], AT[0])
+    state, back = down.step(state, AT[0], AT[0])
     assert (float(first.move[0]), float(back.move[0])) == near((2.0, -2.0))
     assert np.asarray(state.future)[:, -1] == near(np.zeros(2), abs=1e-9)
 
@@ -241,7 +230,7 @@ def test_a_higher_gain_near_closed_makes_the_choke_move_less(even, varied, small
     for schedule in (even, varied):
         controller = continuous_of(small_structure, thesis_fields, schedule)
         state = controller.init(AT[0], np.array([10.0, 7500.0]))
-        moves.append(float(step(controller, state, AT[0], target)[1].moves[:, 0].sum()))
+        moves.append(float(controller.step(state, AT[0], target)[1].moves[:, 0].sum()))
     assert 0.0 < moves[1] < moves[0]
 
 
@@ -251,26 +240,25 @@ def test_tunings_side_by_side_do_what_each_does_alone(varied, small_structure, t
     tunings = [
         make_tuning(shape, **(thesis_fields | {"move_weight": [weight, 0.2]})) for weight in (25.0, 250.0)
     ]
-    lanes = build_lanes(lambda t: ScheduledController(shape, t, varied), stack_tunings(tunings), 2)
     starts = jnp.array([[50.0, 7500.0], [14.0, 6000.0]])
     target = AT[0] + np.array([600.0, 10.0])
 
-    def two(controller, mv):
+    def two(tuning, mv):
+        controller = ScheduledController(shape, tuning, varied)
         state, first = controller.step(controller.init(AT[0], mv), AT[0], target)
         return first.move, controller.step(state, AT[0], target)[1].move
 
-    together = jax.jit(jax.vmap(two, in_axes=(lanes.axes, 0)))(lanes.value, starts)
+    together = jax.jit(jax.vmap(two))(stack_tunings(tunings), starts)
     for i, tuning in enumerate(tunings):
-        alone = jax.jit(two)(ScheduledController(shape, tuning, varied), starts[i])
-        for one, both in zip(alone, together, strict=True):
+        for one, both in zip(two(tuning, starts[i]), together, strict=True):
             assert both[i] == near(one, rel=1e-5, abs=1e-5)
 
 
 def test_the_table_makes_a_controller_once_per_position_and_keeps_the_latest(
     varied, small_structure, small_tuning
 ):
-    controller = ScheduledMixedIntegerController(small_structure, small_tuning, varied, spacing=500.0, kept=2)
-    table = controller.together
+    controller = ScheduledController(small_structure, small_tuning, varied, spacing=500.0, kept=2)
+    table = controller.lanes
     first = table.at([30.0, 7400.0])
     assert table.at([30.0, 7700.0]) is first
     assert table.at([32.0, 7400.0]) is not first
@@ -278,12 +266,12 @@ def test_the_table_makes_a_controller_once_per_position_and_keeps_the_latest(
     table.at([34.0, 7400.0])
     assert table.at([30.0, 7400.0]) is not first
     assert table.built == 4
-    model = first.solver.models[0]
+    model = first.scenarios.models[0]
     assert model.coefficients == near(varied.model_at([30.0, 7500.0]).coefficients, rel=1e-12)
 
 
 @pytest.mark.parametrize(("name", "value"), [("spacing", 0.0), ("spacing", np.nan), ("kept", 0)])
 def test_a_table_that_cannot_be_is_refused(varied, small_structure, small_tuning, name, value):
     with pytest.raises(InputError) as error:
-        ScheduledMixedIntegerController(small_structure, small_tuning, varied, **{name: value})
+        ScheduledController(small_structure, small_tuning, varied, **{name: value})
     assert error.value.field == name

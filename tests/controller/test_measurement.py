@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxmpc.controller.controller import Controllers
 from jaxmpc.controller.measurement import (
     FROZEN,
     GOOD,
@@ -18,7 +19,6 @@ from jaxmpc.controller.measurement import (
     fault_errors,
     received,
 )
-from jaxmpc.controller.mixed_integer import MixedIntegerControllers
 from jaxmpc.errors import InputError
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import make_tuning
@@ -182,8 +182,8 @@ def test_switching_a_cv_off_compiles_nothing(made, kind):
 
 def test_lanes_are_judged_and_switched_each_by_itself(well_like_model, small_structure, thesis_fields):
     tuning = tuned(small_structure, thesis_fields, bad_limit=[2, 2])
-    together = MixedIntegerControllers(small_structure, [tuning], [well_like_model], count=3)
-    single = MixedIntegerControllers(small_structure, [tuning], [well_like_model])
+    together = Controllers(small_structure, [tuning], [well_like_model], count=3)
+    single = Controllers(small_structure, [tuning], [well_like_model])
     cvs = np.tile(START[0], (4, 3, 1))
     cvs[1:, 1, 0] = np.nan
     cvs[2:, 2, :] = np.nan

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxmpc import status
-from jaxmpc.controller.mixed_integer import MixedIntegerController, MixedIntegerControllers
+from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.errors import InputError
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import simulate, simulate_batch
@@ -43,11 +43,9 @@ def loop(controller, setpoints, *, together):
 def test_each_of_several_tunings_does_what_it_does_alone(well_like_model, small_structure, thesis_fields):
     tunings = tunings_of(small_structure, thesis_fields)
     setpoints = START[0] + np.array([[900.0, 6.0], [-700.0, -4.0], [300.0, 3.0]])
-    together = loop(
-        MixedIntegerControllers(small_structure, tunings, [well_like_model]), setpoints, together=True
-    )
+    together = loop(Controllers(small_structure, tunings, [well_like_model]), setpoints, together=True)
     for i, tuning in enumerate(tunings):
-        controller = MixedIntegerController(small_structure, tuning, well_like_model)
+        controller = Controller(small_structure, tuning, well_like_model)
         alone = loop(controller, setpoints[i : i + 1], together=False)
         assert (together.status[:, i] == status.OPTIMAL).all()
         assert (alone.status == status.OPTIMAL).all()
@@ -64,20 +62,16 @@ def test_each_of_several_models_does_what_it_does_alone(well_like_model, small_s
         for factor in (0.8, 1.0, 1.3)
     ]
     setpoints = np.repeat(START[0][None] + np.array([900.0, 6.0]), 3, axis=0)
-    together = loop(
-        MixedIntegerControllers(small_structure, [small_tuning], models), setpoints, together=True
-    )
+    together = loop(Controllers(small_structure, [small_tuning], models), setpoints, together=True)
     for i, model in enumerate(models):
-        alone = loop(
-            MixedIntegerController(small_structure, small_tuning, model), setpoints[i : i + 1], together=False
-        )
+        alone = loop(Controller(small_structure, small_tuning, model), setpoints[i : i + 1], together=False)
         assert together.objective[:, i] == pytest.approx(alone.objective, rel=3e-6)
         assert together.mv[:, i, 0] == pytest.approx(alone.mv[:, 0], abs=1e-9)
 
 
 @pytest.mark.slow
 def test_time_is_charged_to_the_scenario_that_needs_it(well_like_model, small_structure, small_tuning):
-    controllers = MixedIntegerControllers(
+    controllers = Controllers(
         small_structure, [small_tuning], [well_like_model], count=3, time_limit=0.0, finish="branch-and-bound"
     )
     cv, mv = (np.repeat(v[None], 3, axis=0) for v in START)
@@ -89,10 +83,10 @@ def test_time_is_charged_to_the_scenario_that_needs_it(well_like_model, small_st
 
 def test_counts_that_do_not_fit_are_refused(well_like_model, small_structure, small_tuning):
     with pytest.raises(InputError, match="tunings"):
-        MixedIntegerControllers(small_structure, [small_tuning] * 2, [well_like_model] * 3)
+        Controllers(small_structure, [small_tuning] * 2, [well_like_model] * 3)
     with pytest.raises(InputError, match="tunings"):
-        MixedIntegerControllers(small_structure, [], [well_like_model])
-    controllers = MixedIntegerControllers(small_structure, [small_tuning] * 2, [well_like_model])
+        Controllers(small_structure, [], [well_like_model])
+    controllers = Controllers(small_structure, [small_tuning] * 2, [well_like_model])
     with pytest.raises(InputError, match="cv"):
         controllers.init(START[0], START[1])
 
@@ -101,12 +95,12 @@ def test_loops_that_advance_together_are_those_of_each_controller(
     well_like_model, small_structure, small_tuning
 ):
     reference = Reference([0.0, 100.0], START[0] + np.array([[0.0, 0.0], [900.0, 6.0]]), 400.0)
-    controllers = MixedIntegerControllers(small_structure, [small_tuning], [well_like_model], count=2)
+    controllers = Controllers(small_structure, [small_tuning], [well_like_model], count=2)
     plant = WellPlant(actuator="step")
     noise = np.array([20.0, 0.2])
     runs = simulate_batch(controllers, plant, reference, noise=noise, seed=np.array([3, 5]))
     for seed, run in zip((3, 5), runs, strict=True):
-        controller = MixedIntegerController(small_structure, small_tuning, well_like_model)
+        controller = Controller(small_structure, small_tuning, well_like_model)
         alone = simulate(controller, plant, reference, noise=noise, seed=seed)
         assert run.cv == pytest.approx(alone.cv, rel=1e-7)
         assert run.mv[:, 0] == pytest.approx(alone.mv[:, 0], abs=1e-9)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.controller import Controller
 from tests.five_controllers import KINDS, SETPOINT, START, Process, closed, stepped, tuned
 
 FAR = np.array([14000.0, 230.0])
@@ -44,7 +44,7 @@ def test_a_demand_that_may_lead_adds_up_small_moves_until_a_step_choke_follows(
     for lead in (0.0, 2.0):
         slow = thesis_fields | {"move_high": [0.5, 200.0], "move_low": [-0.5, -200.0]}
         tuning = tuned(relaxed, slow, demand_lead=[lead, 0.0])
-        controller, process = ContinuousController(relaxed, tuning, well_like_model), Process(well_like_model)
+        controller, process = Controller(relaxed, tuning, well_like_model), Process(well_like_model)
         state = controller.init(*START)
         for _ in range(40):
             state, _ = controller.step(state, process.cv, FAR, process.mv)

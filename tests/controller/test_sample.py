@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmpc.controller.continuous import ContinuousController
-from jaxmpc.controller.mixed_integer import MixedIntegerController, MixedIntegerControllers
+from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.controller.plan import Planner
 from jaxmpc.errors import InputError
 from tests.five_controllers import KINDS, SETPOINT, START, stepped, tuned
@@ -75,7 +74,7 @@ def test_a_setpoint_trajectory_of_lanes_is_each_lanes_own(
     made, well_like_model, small_structure, thesis_fields
 ):
     tuning = tuned(small_structure, thesis_fields)
-    together = MixedIntegerControllers(small_structure, [tuning], [well_like_model], count=2)
+    together = Controllers(small_structure, [tuning], [well_like_model], count=2)
     state = together.init(np.tile(START[0], (2, 1)), np.tile(START[1], (2, 1)))
     later = np.tile(SETPOINT, (2, 40, 1))
     later[1, :20] = START[0]
@@ -96,7 +95,7 @@ def test_gaps_and_time_limits_that_mean_nothing_are_refused(
 ):
     (field,) = limits
     with pytest.raises(InputError, match=f"^{field}: "):
-        MixedIntegerController(small_structure, small_tuning, well_like_model, **limits)
+        Controller(small_structure, small_tuning, well_like_model, **limits)
     rows = np.tile(START[0], (40, 1))
     with pytest.raises(InputError, match=f"^{field}: "):
         Planner(small_structure, small_tuning, well_like_model).solve(
@@ -150,4 +149,3 @@ def test_a_continuous_step_may_be_scanned_and_mapped(made):
         state, info = controller.step(state, cv, SETPOINT)
         moves.append(info.move)
     np.testing.assert_allclose(scanned, moves, atol=1e-6)  # programs that differ in rounding
-    assert isinstance(controller, ContinuousController)

@@ -3,19 +3,18 @@
 import dataclasses
 import itertools
 
-import equinox as eqx
 import jax
 import numpy as np
 import pytest
 
 from jaxmpc import status
-from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.measurement import SensorFault, fault_errors
-from jaxmpc.controller.mixed_integer import MixedIntegerController
 from jaxmpc.controller.plan import Planner, solve_plan
-from jaxmpc.controller.targets import TargetController, augment, simulate_with_targets
+from jaxmpc.controller.targets import TargetController, augment
 from jaxmpc.errors import InputError
 from jaxmpc.loop.reference import Reference
+from jaxmpc.loop.targets import simulate_with_targets
 from jaxmpc.model.step_response import make_model
 from jaxmpc.problem.blocking import sample_moves
 from jaxmpc.problem.structure import Structure
@@ -34,16 +33,12 @@ def price(structure, moves, mv_now, target, weight):
     return float((weight * (u[held][structure.first_penalised - 1 :] - target) ** 2).sum())
 
 
-jitted = eqx.filter_jit(lambda controller, *given: controller.step(*given))
-
-
 def step_from_steady(controller, *, target=TARGET, setpoint=SETPOINT, samples=1):
     """Some samples against constant measurements; the last state and all infos."""
     state, infos = controller.init(CV, MV), []
     inputs = (CV, setpoint, target) if isinstance(controller, TargetController) else (CV, setpoint)
-    step = jitted if not controller.structure.integer_mvs else lambda c, *given: c.step(*given)
     for _ in range(samples):
-        state, info = step(controller, state, *inputs)
+        state, info = controller.step(state, *inputs)
         infos.append(info)
     return state, infos
 
@@ -145,8 +140,7 @@ def test_a_weight_of_zero_gives_the_moves_of_the_controller_without_targets(
 ):
     structure = small_structure if integer else small_structure.relaxed()
     tuning = make_tuning(structure, **thesis_fields)
-    kind = MixedIntegerController if integer else ContinuousController
-    _, plain = step_from_steady(kind(structure, tuning, well_like_model), samples=6)
+    _, plain = step_from_steady(Controller(structure, tuning, well_like_model), samples=6)
     zero = TargetController(structure, tuning, well_like_model, {"choke": 0.0, "lift": 0.0})
     _, same = step_from_steady(zero, samples=6)
     assert np.abs([np.asarray(info.move) for info in plain]).max() > 1.0
@@ -161,7 +155,7 @@ def test_no_targets_leave_the_problem_as_it_is(well_like_model, small_structure,
     controller = TargetController(*given, {})
     assert controller.controller.structure is small_structure
     _, (info,) = step_from_steady(controller)
-    _, (plain,) = step_from_steady(MixedIntegerController(*given))
+    _, (plain,) = step_from_steady(Controller(*given))
     assert np.array_equal(info.move, plain.move)
 
 
@@ -197,7 +191,7 @@ def test_continuous_steps_can_be_jitted_and_mapped_over_weights(
     wide = [augment(structure, tuning, well_like_model, weight) for weight in weights]
 
     def moves(tuning):
-        controller = ContinuousController(wide[0][0], tuning, wide[0][2])
+        controller = Controller(wide[0][0], tuning, wide[0][2])
         state = controller.init(np.append(CV, MV), MV)
         return controller.step(state, np.append(CV, MV), np.append(SETPOINT, TARGET))[1].moves
 

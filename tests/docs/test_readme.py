@@ -35,7 +35,7 @@ def options_of(words: list[str]) -> set[str]:
 
 
 def test_the_example_runs_as_typed(capsys):
-    (example,) = blocks("python", "MixedIntegerController(")
+    (example,) = blocks("python", "Controller(")
     exec(compile(example, "README.md", "exec"), {"__name__": "__main__"})
     assert re.fullmatch(r"one hour: choke travel \d+ %, largest gap \de-\d\d\n", capsys.readouterr().out)
 

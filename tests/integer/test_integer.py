@@ -3,23 +3,22 @@
 import itertools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxmpc import status
 from jaxmpc.integer import listing as compiled_lists
 from jaxmpc.integer import search as compiled_search
-from jaxmpc.integer.constants import Constants
 from jaxmpc.integer.cuts import Cuts
 from jaxmpc.integer.feasible import Chain, nearest, propagate, satisfied
 from jaxmpc.integer.host_search import Search
-from jaxmpc.integer.listing import Tables
 from jaxmpc.integer.lower_bound import enumerate_below, exclude
 from jaxmpc.integer.relaxer import Relaxer
 from jaxmpc.integer.scheduling import run
-from jaxmpc.integer.solve import FINISHES, solve_integer, solve_integers
-from jaxmpc.problem.condense import condense, make_instance
+from jaxmpc.integer.solve import FINISHES, solve_integers
+from jaxmpc.integer.tables import Constants
+from jaxmpc.programs.lanes import for_all
+from tests.posed import pose
 
 NONE = np.zeros((0, 4)), np.zeros(0), np.zeros(0)
 
@@ -66,42 +65,55 @@ def one(tree):
     return jax.tree.map(lambda leaf: np.asarray(leaf)[None], tree)
 
 
+def relaxer_of(constants):
+    """The compiled relaxations of one scenario."""
+    return Relaxer(for_all(constants.qp), [constants])
+
+
+def root_of(constants, instances, warm=None):
+    """Relaxations of problems with a lane axis, from a cold start if none is given."""
+    relaxer = relaxer_of(constants)
+    return relaxer.solve_roots(instances, relaxer.cold(instances) if warm is None else warm)
+
+
 def started(constants, instance):
     """A search whose root is solved."""
-    root = Relaxer([constants]).solve_roots(one(instance), one(constants.cold))
-    return Search(constants, instance, root, 1e-6, None)
+    return Search(constants, instance, root_of(constants, one(instance)), 1e-6, None)
+
+
+def solve_integer(constants, instance, *, starts=(), warm=None, **options):
+    """One step, from its relaxation on."""
+    root = root_of(constants, one(instance), warm)
+    return solve_integers(relaxer_of(constants), one(instance), root, starts=[list(starts)], **options)[0]
 
 
 def answered(constants, instance, search, steps):
     """What a part of a search returns once its problems are solved."""
-    return run(Relaxer([constants]), one(instance), [(0, search, steps)])[0]
+    return run(relaxer_of(constants), one(instance), [(0, search, steps)])[0]
 
 
 @pytest.fixture(scope="module")
 def problems(small_structure, small_tuning, well_like_model):
     """Twelve steps near, off and far from the setpoint, with all 3^6 whole plans solved for each."""
     rng = np.random.default_rng(1)
-    constants = Constants(
-        small_structure, condense(small_structure, small_tuning, well_like_model.coefficients)
-    )
-    make = jax.jit(
-        lambda free, target, choke: make_instance(
-            small_structure,
-            small_tuning,
-            constants.qp,
-            free_response=free,
-            setpoint=target,
-            mv_now=jnp.stack([choke, 7500.0]),
-            last_move=jnp.asarray([2.0, 0.0]),
-        )
-    )
     plans = np.array(list(itertools.product((-1, 0, 1), repeat=6)))
-    result = []
+    result, constants = [], None
     for k in range(12):
         spread = (0.3, 1.0, 3.0)[k % 3]
         free = np.array([11000.0, 185.0]) + np.cumsum(rng.normal(size=(40, 2)) * [60.0, 0.5], axis=0)
         target = np.tile(np.array([11000.0, 185.0]) + spread * rng.normal(size=2) * [900.0, 9.0], (40, 1))
-        instance = make(free, target, float(rng.choice([0.0, 50.0, 98.0])))
+        posed = pose(
+            small_structure,
+            small_tuning,
+            well_like_model.coefficients,
+            free_response=free,
+            setpoint=target,
+            mv_now=[float(rng.choice([0.0, 50.0, 98.0])), 7500.0],
+            last_move=[2.0, 0.0],
+        )
+        instance = jax.tree.map(np.asarray, posed.instance)
+        if constants is None:
+            constants = Constants(small_structure, posed.size, jax.tree.map(np.asarray, posed.qp))
         search = started(constants, instance)
         low, high = (np.round(v[:6]).astype(int) for v in search.limits)
         points = plans[satisfied(search.chains, plans, low, high)]
@@ -165,10 +177,10 @@ def test_cuts_at_solved_plans_bound_every_plan_and_touch_their_own(problems):
 def test_scenarios_solved_together_get_the_answers_they_get_alone(problems):
     constants = problems[0][0]
     instances = jax.tree.map(lambda *leaves: np.stack(leaves), *(p[1] for p in problems))
-    cold = jax.tree.map(lambda leaf: np.repeat(leaf[None], len(problems), axis=0), constants.cold)
+    root = root_of(constants, instances)
     for finish in FINISHES:
-        together, _ = solve_integers(
-            Relaxer([constants]), instances, starts=[[] for _ in problems], warm=cold, finish=finish
+        together = solve_integers(
+            relaxer_of(constants), instances, root, starts=[[] for _ in problems], finish=finish
         )
         for result, (*_, values) in zip(together, problems, strict=True):
             assert result.status == status.OPTIMAL
@@ -181,7 +193,7 @@ def test_a_start_or_prices_from_elsewhere_never_change_the_answer(problems):
     other = solve_integer(*problems[0][:2]).root
     for constants, instance, _, values in problems[1:6]:
         starts = [rng.normal(size=6) * 5]
-        result = solve_integer(constants, instance, starts=starts, warm=other)
+        result = solve_integer(constants, instance, starts=starts, warm=one(other))
         assert result.status == status.OPTIMAL
         assert result.value == pytest.approx(values.min(), rel=1e-6)
 
@@ -197,20 +209,18 @@ def test_an_expired_time_limit_returns_a_feasible_plan_with_its_true_gap(problem
     assert status.LIMIT in seen
 
 
-@pytest.fixture
-def searched(small_structure):
-    """What the compiled search finds for one of `problems`; compiled after constants of it were changed."""
+INTEGERS = 8  # room for the six integer moves
 
-    @jax.jit
-    def decide(qp, tables, rows, instance, root):
-        return compiled_search.decide(small_structure, qp, tables, rows, instance, root, 1e-6)
+
+@pytest.fixture
+def searched():
+    """What the compiled search finds for one of `problems`; compiled after constants of it were changed."""
+    decide = jax.jit(lambda *arguments: compiled_search.decide(*arguments))
 
     def search(problem):
         constants, instance, _, _ = problem
-        relaxer = Relaxer([constants])
-        root = relaxer.solve_roots(one(instance), one(constants.cold)).solved
-        root = jax.tree.map(lambda leaf: leaf[0], root)
-        return decide(constants.qp, Tables.of(constants), relaxer.rows, instance, root)
+        cold = jax.tree.map(lambda leaf: leaf[0], relaxer_of(constants).cold(one(instance)))
+        return decide(constants.qp, constants.tables(INTEGERS), instance, cold, 1e-6)
 
     return search
 
@@ -242,24 +252,19 @@ def test_a_list_that_does_not_fit_is_not_claimed_to_be_done(searched, problems, 
 
 
 @pytest.mark.slow
-def test_a_batch_of_compiled_searches_in_lockstep_is_each_alone(small_structure, searched, problems):
+def test_a_batch_of_compiled_searches_in_lockstep_is_each_alone(searched, problems, monkeypatch):
     """What an accelerator runs for scenarios of one controller."""
     constants = problems[0][0]
-    relaxer = Relaxer([constants])
+    relaxer, tables = relaxer_of(constants), constants.tables(INTEGERS)
     instances = jax.tree.map(lambda *leaves: np.stack(leaves), *[problem[1] for problem in problems])
-    cold = jax.tree.map(lambda leaf: np.repeat(leaf[None], len(problems), axis=0), constants.cold)
-    roots = relaxer.solve_roots(instances, cold).solved
-
-    def lane(instance, root):
-        tables = Tables.of(constants)
-        return compiled_search.decide_lane(
-            small_structure, constants.qp, tables, relaxer.rows, instance, root, 1e-6
-        )
-
-    together = jax.jit(jax.vmap(lane))(instances, roots)
-    for k, problem in enumerate(problems):
-        alone = searched(problem)
-        assert bool(together.closed[k]) == bool(alone.closed)
-        if alone.closed:
-            np.testing.assert_allclose(together.value[k], alone.value, rtol=1e-6)
-            assert int(together.finished_by[k]) == int(alone.finished_by)
+    alone = [searched(problem) for problem in problems]
+    monkeypatch.setattr("jax.default_backend", lambda: "gpu")  # all lanes in lockstep
+    decide = lambda *arguments: compiled_search.decide(*arguments)  # noqa: E731
+    together = jax.jit(jax.vmap(decide, in_axes=(None, None, 0, 0, None)))(
+        constants.qp, tables, instances, relaxer.cold(instances), 1e-6
+    )
+    for k, found in enumerate(alone):
+        assert bool(together.closed[k]) == bool(found.closed)
+        if found.closed:
+            np.testing.assert_allclose(together.value[k], found.value, rtol=1e-6)
+            assert int(together.finished_by[k]) == int(found.finished_by)

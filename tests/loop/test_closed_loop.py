@@ -12,10 +12,8 @@ import pytest
 
 from identify.step_test import identify_step_response
 from jaxmpc import status
-from jaxmpc.controller.batch import controller_batch, per_lane
-from jaxmpc.controller.continuous import ContinuousController
+from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.controller.measurement import MISSING, OUTSIDE, SensorFault, fault_errors
-from jaxmpc.controller.mixed_integer import MixedIntegerController
 from jaxmpc.errors import InputError
 from jaxmpc.loop.noise import noise_samples
 from jaxmpc.loop.reference import Reference
@@ -23,6 +21,7 @@ from jaxmpc.loop.simulate import simulate, simulate_batch, simulate_batches
 from jaxmpc.process.plant import WellPlant
 from jaxmpc.process.well.equations import WellParameters
 from jaxmpc.process.well.host import HostWell
+from jaxmpc.programs.lanes import per_lane
 from studies.definition import presets
 
 TO_30_PERCENT = Reference([0.0, 200.0], [[11013.0, 185.0], [12600.0, 175.0]], 1200.0)
@@ -34,8 +33,8 @@ def model():
 
 
 def controller_of(kind, model):
-    structure = presets.structure(integer=kind is MixedIntegerController)
-    return kind(structure, presets.tuning(structure), model)
+    structure = presets.structure(integer=kind == "mixed-integer")
+    return Controller(structure, presets.tuning(structure), model)
 
 
 @pytest.mark.skipif(
@@ -44,9 +43,9 @@ def controller_of(kind, model):
 @pytest.mark.parametrize(
     ("kind", "actuator"),
     [
-        pytest.param(ContinuousController, "continuous", marks=pytest.mark.slow),
-        (ContinuousController, "step"),
-        (MixedIntegerController, "step"),
+        pytest.param("continuous", "continuous", marks=pytest.mark.slow),
+        ("continuous", "step"),
+        ("mixed-integer", "step"),
     ],
 )
 def test_the_fmu_and_the_jax_well_close_the_same_loop(model, kind, actuator):
@@ -63,12 +62,12 @@ def test_the_fmu_and_the_jax_well_close_the_same_loop(model, kind, actuator):
     assert (real.status == status.OPTIMAL).all()
     assert (twin.status == status.OPTIMAL).all()
     assert not (real.fallback | twin.fallback).any()
-    assert np.ptp(real.mv[:, 0]) > 0 or kind is MixedIntegerController
+    assert np.ptp(real.mv[:, 0]) > 0 or kind == "mixed-integer"
     assert (np.nan_to_num(real.gap, nan=1.0) <= 1e-6).all()
 
 
 def test_a_loop_starts_in_steady_state_and_follows_the_setpoint(model):
-    run = simulate(controller_of(ContinuousController, model), WellPlant(), TO_30_PERCENT)
+    run = simulate(controller_of("continuous", model), WellPlant(), TO_30_PERCENT)
     # before the change at 200 s there is only the rounding of the setpoints to make up for, 0.2 m3/h of gas
     assert np.abs(run.move[:20]).max() < 0.02
     before = np.abs(run.cv[20] - run.setpoint[20])
@@ -82,7 +81,7 @@ def test_a_loop_starts_in_steady_state_and_follows_the_setpoint(model):
 def test_a_pressure_drop_reaches_the_well_and_lift_answers(model):
     offset = np.where(np.arange(120) >= 30, -3.0, 0.0)
     run = simulate(
-        controller_of(MixedIntegerController, model),
+        controller_of("mixed-integer", model),
         WellPlant(actuator="step"),
         Reference([0.0], [[11013.0, 185.0]], 1200.0),
         disturbance=offset,
@@ -99,12 +98,17 @@ LIMITS = dict(
 
 
 @pytest.fixture(scope="module")
-def lanes(model):
+def singles(model):
     structure = presets.structure()
     tunings = [
         presets.tuning(structure, changes={"move_weight": {"choke": w, "gas_lift": 0.2}}) for w in WEIGHTS
     ]
-    return controller_batch(structure, tunings, model, summed=False)
+    return [Controller(structure, tuning, model) for tuning in tunings]
+
+
+@pytest.fixture(scope="module")
+def lanes(model, singles):
+    return Controllers(singles[0].structure, [one.tuning for one in singles], model)
 
 
 def whole(batches):
@@ -113,14 +117,14 @@ def whole(batches):
     return {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0].fields}
 
 
-def test_a_batch_of_loops_is_each_loop_alone(lanes):
+def test_a_batch_of_loops_is_each_loop_alone(lanes, singles):
     offsets = np.linspace(-2.0, 2.0, 5)[:, None] * np.ones(25)
     references = [
         Reference([0.0, 30.0 * (k + 1)], [[11013.0, 185.0], [12600.0, 175.0]], 250.0) for k in range(5)
     ]
     together = simulate_batch(lanes, WellPlant(), references, disturbance=offsets)
     for k, lane in enumerate(together):
-        alone = simulate(lanes.lane(k), WellPlant(), references[k], disturbance=offsets[k])
+        alone = simulate(singles[k], WellPlant(), references[k], disturbance=offsets[k])
         np.testing.assert_allclose(lane.mv, alone.mv, atol=1e-2)  # [% and m3/h], as above
         np.testing.assert_array_equal(lane.setpoint, alone.setpoint)
         np.testing.assert_array_equal(lane.time, alone.time)
@@ -129,14 +133,14 @@ def test_a_batch_of_loops_is_each_loop_alone(lanes):
 
 
 @pytest.mark.slow
-def test_wells_may_have_lanes_and_controllers_none(lanes):
+def test_wells_may_have_lanes_and_controllers_none(singles):
     indices = jnp.asarray([0.95, 1.0, 1.05])
     wells = eqx.filter_vmap(
         lambda share: WellPlant(WellParameters(productivity=share * WellParameters().productivity))
     )(indices)
-    together = simulate_batch(lanes.lane(2), per_lane(wells), TO_30_PERCENT, samples=5)
+    together = simulate_batch(singles[2], per_lane(wells), TO_30_PERCENT, samples=5)
     assert len(together) == 3
-    alone = simulate(lanes.lane(2), per_lane(wells).lane(0), TO_30_PERCENT, samples=5)
+    alone = simulate(singles[2], per_lane(wells).lane(0), TO_30_PERCENT, samples=5)
     np.testing.assert_allclose(together[0].cv, alone.cv, rtol=1e-6)
     assert together[0].cv[0, 1] < together[1].cv[0, 1] < together[2].cv[0, 1]
 
@@ -150,7 +154,7 @@ def test_neither_pieces_of_lanes_nor_of_samples_nor_padding_change_results(lanes
     pieces = run(lanes_at_once=2)
     assert [list(piece.lanes) for piece in pieces] == [[0, 1], [2, 3], [4]]
     in_pieces = whole(pieces)  # the third piece was half copies
-    monkeypatch.setattr("jaxmpc.loop.compiled.CHUNK", 9)
+    monkeypatch.setattr("jaxmpc.loop.compiled.LONGEST", 9)
     in_time = whole(run())  # two samples too many
     for name in at_once:
         if name in ("nodes", "gap", "bound", "solve_time"):
@@ -159,7 +163,7 @@ def test_neither_pieces_of_lanes_nor_of_samples_nor_padding_change_results(lanes
         np.testing.assert_allclose(in_time[name], at_once[name], **LIMITS, err_msg=name)
 
 
-def test_noise_is_named_by_its_seed(lanes):
+def test_noise_is_named_by_its_seed(lanes, singles):
     run = lambda **how: whole(  # noqa: E731
         simulate_batches(lanes, WellPlant(), TO_30_PERCENT, samples=25, **how)
     )["cv"]
@@ -172,7 +176,7 @@ def test_noise_is_named_by_its_seed(lanes):
     paired = run(noise=[40.0, 0.5], seed=np.array([7, 7, 7, 8, 8]))
     np.testing.assert_array_equal(paired[0, 0], paired[1, 0])
     assert (paired[2, 0] != paired[3, 0]).all()
-    alone = simulate(lanes.lane(3), WellPlant(), TO_30_PERCENT, samples=25, noise=[40.0, 0.5], seed=8)
+    alone = simulate(singles[3], WellPlant(), TO_30_PERCENT, samples=25, noise=[40.0, 0.5], seed=8)
     np.testing.assert_allclose(alone.cv, paired[3], **LIMITS)
     deviations = np.array([[40.0, 0.5]]) * np.array([[0.0], [1.0], [1.0], [1.0], [1.0]])
     np.testing.assert_array_equal(run(noise=deviations, seed=1)[0, 0], quiet[0, 0])
@@ -231,13 +235,13 @@ import sys
 import jax
 import numpy as np
 from jaxmpc import Reference, StepResponseModel, WellPlant
-from jaxmpc.controller.batch import controller_batch
+from jaxmpc.controller.controller import Controllers
 from jaxmpc.loop.simulate import simulate_batches
 from studies.definition import presets
 assert jax.device_count() == 4
 structure = presets.structure()
 tunings = [presets.tuning(structure, changes={"move_weight": {"choke": w, "gas_lift": 0.2}}) for w in WEIGHTS]
-lanes = controller_batch(structure, tunings, StepResponseModel.load(sys.argv[1]), summed=False)
+lanes = Controllers(structure, tunings, StepResponseModel.load(sys.argv[1]))
 reference = Reference([0.0, 200.0], [[11013.0, 185.0], [12600.0, 175.0]], 1200.0)
 (batch,) = simulate_batches(lanes, WellPlant(), reference, samples=25, noise=[40.0, 0.5])
 np.savez(sys.argv[2], **batch.fields)
@@ -279,12 +283,12 @@ def test_several_devices_give_the_results_of_one(lanes, model, tmp_path):
         ({"position_feedback": 1.0}, "position_feedback"),
         ({"samples": 121}, "reference.duration"),
         ({"plants": WellPlant(dt=5.0)}, "plant.dt"),
-        ({"controllers": "batched by hand"}, "controllers"),
+        ({"controllers": "what they know"}, "controllers"),
         ({"lanes_at_once": 0}, "lanes_at_once"),
     ],
 )
-def test_a_sweep_that_does_not_fit_is_refused_before_it_starts(lanes, change, field):
-    given = {"alone": lanes.lane(0), "batched by hand": lanes.value}
+def test_a_sweep_that_does_not_fit_is_refused_before_it_starts(lanes, singles, change, field):
+    given = {"alone": singles[0], "what they know": lanes.cores}
     arguments = {"controllers": lanes, "plants": WellPlant(), "reference": TO_30_PERCENT} | change
     controllers = arguments.pop("controllers")
     with pytest.raises(InputError) as error:
@@ -316,7 +320,7 @@ def test_faults_of_sensors_and_told_positions_are_the_same_in_compiled_loops_and
         "measurement_low": {"gas_rate": None, "oil_rate": 20.0},
         "bad_limit": {"gas_rate": 5, "oil_rate": None},
     }
-    controller = ContinuousController(structure, presets.tuning(structure, changes=changes), model)
+    controller = Controller(structure, presets.tuning(structure, changes=changes), model)
     faults = [
         SensorFault("gas_rate", "missing", 100.0, 100.0),
         SensorFault("oil_rate", "frozen", 300.0, 150.0),
@@ -326,7 +330,7 @@ def test_faults_of_sensors_and_told_positions_are_the_same_in_compiled_loops_and
     plant = WellPlant(actuator="step")
     compiled = simulate(controller, plant, TO_30_PERCENT, **given)
     stepped = simulate(controller, OnTheHost(plant), TO_30_PERCENT, **given)
-    lanes = controller_batch(structure, [controller.tuning] * 2, model)
+    lanes = Controllers(structure, [controller.tuning] * 2, model)
     both = {
         key: np.stack([np.zeros_like(value), value]) if key == "faults" else value
         for key, value in given.items()
@@ -361,7 +365,7 @@ def test_a_run_that_does_not_fit_is_refused_before_it_starts(model, change, fiel
     arguments = {"plant": WellPlant(), "reference": TO_30_PERCENT} | change
     with pytest.raises(InputError) as error:
         simulate(
-            controller_of(ContinuousController, model),
+            controller_of("continuous", model),
             arguments.pop("plant"),
             arguments.pop("reference"),
             **arguments,

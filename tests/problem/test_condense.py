@@ -6,18 +6,14 @@ import numpy as np
 import pytest
 
 from jaxmpc.errors import InputError
-from jaxmpc.problem.blocking import (
-    hard_rows,
-    oscillation_rows,
-    position_rows,
-    sample_moves,
-    single_step_blocks,
-    window_rows,
-)
-from jaxmpc.problem.condense import condense, dynamic_matrix, make_instance
+from jaxmpc.problem.blocking import sample_moves, single_step_blocks, window_rows
+from jaxmpc.problem.condense import Rows, condense, dynamic_matrix, matrices_of
+from jaxmpc.problem.layout import Size, layout_of
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import make_tuning
 from jaxmpc.relaxed.problem import evaluate
+from tests.oracles.kkt import dense_rows
+from tests.posed import over, pose
 
 BLOCKS = (1, 1, 2, 3, 5)
 
@@ -32,6 +28,18 @@ def structure(**changes):
         integer_step=(2.0, None),
     )
     return Structure(**(base | changes))
+
+
+_matrix = jax.jit(dynamic_matrix)
+
+
+def matrix_of(s: Structure, coefficients):
+    """The dynamic matrix of a structure at j = 1..Hp, without its padding."""
+    size = Size.of(s, coefficients.shape[-1])
+    theta = np.asarray(
+        _matrix(layout_of(s, size), over(coefficients, size.future), np.arange(1, size.horizon + 1))
+    )
+    return theta[:, : s.prediction_horizon, :, : s.block_count]
 
 
 def sample_by_sample(coefficients, moves, horizon):
@@ -51,18 +59,17 @@ def test_the_blocked_dynamic_matrix_superposes_step_responses(blocking, samples,
     rng = np.random.default_rng(samples)
     s = structure(blocking=blocking, prediction_horizon=horizon)
     coefficients, moves = rng.normal(size=(2, 2, samples)), rng.normal(size=(5, 2))
-    theta = np.asarray(dynamic_matrix(s, jnp.asarray(coefficients)))
+    theta = matrix_of(s, coefficients)
     got = np.einsum("cjmb,bm->cj", theta, moves)
     expected = sample_by_sample(coefficients, sample_moves(s) @ moves, horizon)
     np.testing.assert_allclose(got, expected, atol=1e-12)  # the same sums in another order
 
 
 def test_blocks_of_one_are_no_blocking():
-    coefficients = jnp.asarray(np.random.default_rng(1).normal(size=(2, 2, 9)))
+    coefficients = np.random.default_rng(1).normal(size=(2, 2, 9))
     plain = structure(blocks=(), control_horizon=6)
     both = [
-        dynamic_matrix(dataclasses.replace(plain, blocking=mode), coefficients)
-        for mode in ("moves", "inputs")
+        matrix_of(dataclasses.replace(plain, blocking=mode), coefficients) for mode in ("moves", "inputs")
     ]
     np.testing.assert_allclose(both[0], both[1], atol=1e-12)
     assert both[0].shape == (2, 15, 2, 6)
@@ -71,21 +78,74 @@ def test_blocks_of_one_are_no_blocking():
 @pytest.mark.parametrize("blocking", ["moves", "inputs"])
 def test_hard_rows_say_what_the_samples_do(blocking):
     """Positions at block ends and oscillation rows bound the same plans as every sample does."""
-    s = structure(blocking=blocking, control_horizon=7, blocks=(1, 1, 2, 3))
+    s = structure(
+        blocking=blocking, control_horizon=7, blocks=(1, 1, 2, 3), mv_names=("u",), integer_step=(2.0,)
+    )
+    layout, rows = layout_of(s, Size.of(s, 9)), rows_of(s, Size.of(s, 9))
     rng = np.random.default_rng(2)
     agree = {True: 0, False: 0}
-    for _ in range(3000):
-        d = rng.integers(-2, 3, size=4)
+    moves = rng.integers(-2, 3, size=(3000, 4))
+    for d, along in zip(moves, np.asarray(jax.vmap(rows.of)(jnp.asarray(moves, dtype=float))), strict=True):
         samples = sample_moves(s) @ d
         by_sample = np.abs(np.cumsum(samples)).max() <= 3 and np.abs(np.diff(samples)).max() <= 1
         by_rows = (
-            np.abs(position_rows(s) @ d).max() <= 3
-            and np.abs(oscillation_rows(s) @ d).max(initial=0) <= 1
+            np.abs(along[:4]).max() <= 3
+            and np.abs(along[4:][layout.coupled]).max(initial=0) <= 1
             and np.abs(d[single_step_blocks(s)]).max(initial=0) <= 1
         )
         assert by_sample == by_rows
         agree[by_rows] += 1
     assert min(agree.values()) > 10
+
+
+def rows_of(s: Structure, size: Size) -> Rows:
+    """The hard rows of a structure in arrays of a size."""
+    layout = layout_of(s, size)
+    return Rows.of_layout(layout)
+
+
+ROWS = {
+    "moves": {},
+    "inputs": dict(blocking="inputs"),
+    "windows": dict(mean_move_mode="predictive", mean_move_window=3),
+    "windows, inputs": dict(mean_move_mode="predictive", mean_move_window=4, blocking="inputs"),
+    "windows of all samples": dict(mean_move_mode="predictive", mean_move_window=40),
+    "three MVs, one block": dict(mv_names=("u", "v", "w"), integer_step=(), blocks=(12,)),
+}
+
+
+@pytest.mark.parametrize("room", [False, True])
+@pytest.mark.parametrize("name", ROWS)
+def test_products_of_hard_rows_are_those_of_the_dense_matrix(name, room):
+    """By structure and by every sample; in arrays of the structure's own size and of a larger one."""
+    s = structure(**ROWS[name])
+    size = Size.of(s, 9)
+    if room:
+        size = size._replace(blocks=16, horizon=64, windows=64 if size.windows else 0)
+    rows, dense, rng = rows_of(s, size), dense_rows(s, size), np.random.default_rng(6)
+    x, prices, weights = (
+        rng.normal(size=size.moves),
+        rng.normal(size=len(dense)),
+        rng.uniform(size=len(dense)),
+    )
+    along, pulled, squared, sizes = _products(rows, x, prices, weights)
+    close = dict(rtol=1e-12, atol=1e-12)  # the same sums in another order
+    np.testing.assert_allclose(along, dense @ x, **close)
+    np.testing.assert_allclose(pulled, dense.T @ prices, **close)
+    np.testing.assert_allclose(squared, dense.T @ (weights[:, None] * dense), **close)
+    np.testing.assert_allclose(sizes, (dense**2).sum(axis=1), **close)
+    for share in (0.0, 0.2, 1.0):
+        free = (rng.uniform(size=size.moves) < share).astype(float)
+        np.testing.assert_array_equal(_touched(rows, free), np.abs(dense) @ free > 0.0)
+
+
+@jax.jit
+def _products(rows: Rows, x, prices, weights):
+    mvs = prices.shape[0] // rows.size.shape[0]
+    return rows.of(x), rows.pull(prices), rows.square(weights), rows.spread(rows.size, mvs)
+
+
+_touched = jax.jit(Rows.touch)
 
 
 def test_window_rows_sum_the_moves_of_the_window():
@@ -114,15 +174,16 @@ def test_the_condensed_objective_is_the_objective_of_the_thesis():
             move_low=[-6.0, -7.0],
             move_high=[6.0, 7.0],
         )
-        coefficients = jnp.asarray(rng.normal(size=(2, 2, 9)))
-        qp = condense(s, t, coefficients, envelope=envelope)
+        coefficients = rng.normal(size=(2, 2, 9))
         free, target = rng.normal(size=(15, 2)), rng.normal(size=(15, 2))
-        instance = make_instance(
-            s, t, qp, free_response=free, setpoint=target, mv_now=jnp.zeros(2), last_move=jnp.zeros(2)
+        posed = pose(
+            s, t, coefficients, free_response=free, setpoint=target, mv_now=[0.0, 0.0], envelope=envelope
         )
-        x = np.concatenate([rng.integers(-widest, widest + 1, size=5), rng.normal(size=5)])
-        moves = (x * np.asarray(qp.scale)).reshape(2, 5).T
-        y = free + sample_by_sample(np.asarray(coefficients), sample_moves(s) @ moves, 15).T
+        qp, instance = posed.qp, posed.instance
+        x = np.zeros((2, posed.size.blocks))  # what follows the five blocks is padding
+        x[:, :5] = [rng.integers(-widest, widest + 1, size=5), rng.normal(size=5)]
+        moves = (x * np.asarray(qp.scale).reshape(2, -1))[:, :5].T
+        y = free + sample_by_sample(coefficients, sample_moves(s) @ moves, 15).T
         y, e = y[2:], (y - target)[2:]
         beyond = np.maximum(np.abs(e) - [0.3, 1.0], 0)
         value = (e**2 * [0.5, 0.0] + beyond**2 * [0.0, 2.0] + beyond * [1.0, 0.0]).sum()
@@ -132,7 +193,13 @@ def test_the_condensed_objective_is_the_objective_of_the_thesis():
             np.maximum((np.array([-np.inf, -0.5]) - y).max(0), 0),
         )
         value += (np.array([10.0, 5.0]) * (over + under)).sum()
-        assert float(evaluate(qp, instance, jnp.asarray(x))) == pytest.approx(value, rel=1e-12)
+        assert float(evaluate(qp, instance, jnp.asarray(x.reshape(-1)))) == pytest.approx(value, rel=1e-12)
+
+
+def steady(s: Structure, tuning, **step):
+    """The problem of a step at its setpoint, of responses of one."""
+    zero = np.zeros((15, 2))
+    return pose(s, tuning, np.ones((2, 2, 5)), free_response=zero, setpoint=zero, **step)
 
 
 @pytest.mark.parametrize("drift", [-1e-10, 0.0, 1e-10])
@@ -141,19 +208,9 @@ def test_float_drift_at_a_limit_does_not_cost_a_step(drift):
     t = make_tuning(
         s, cv_weight=1.0, move_weight=1.0, mv_low=0.0, mv_high=100.0, move_low=-2.0, move_high=2.0
     )
-    qp = condense(s, t, jnp.ones((2, 2, 5)))
-    zero = jnp.zeros((15, 2))
-    instance = make_instance(
-        s,
-        t,
-        qp,
-        free_response=zero,
-        setpoint=zero,
-        mv_now=jnp.asarray([98.0 + drift, 50.0]),
-        last_move=jnp.asarray([-2.000000465, 0.0]),
-    )
-    rows = slice(0, 5)
-    assert np.array_equal(instance.row_high[rows], np.ones(5))
+    posed = steady(s, t, mv_now=[98.0 + drift, 50.0], last_move=[-2.000000465, 0.0])
+    instance = posed.instance
+    assert np.array_equal(instance.row_high[:5], np.ones(5))
     assert np.array_equal(instance.lower[:5], -np.ones(5))
 
 
@@ -170,19 +227,10 @@ def test_the_past_move_enters_the_oscillation_rows_rounded():
         move_high=2.0,
         oscillation_rows={"u": True},
     )
-    qp = condense(s, t, jnp.ones((2, 2, 5)))
-    zero = jnp.zeros((15, 2))
-    instance = make_instance(
-        s,
-        t,
-        qp,
-        free_response=zero,
-        setpoint=zero,
-        mv_now=jnp.asarray([0.0, 50.0]),
-        last_move=jnp.asarray([-2.000000465, 0]),
-    )
+    posed = steady(s, t, mv_now=[0.0, 50.0], last_move=[-2.000000465, 0.0])
+    instance = posed.instance
     assert (float(instance.lower[0]), float(instance.upper[0])) == (0.0, 0.0)
-    assert hard_rows(s).shape[0] == len(instance.row_low)
+    assert posed.rows.shape[0] == len(instance.row_low)
 
 
 def test_an_mv_outside_its_limits_may_return_the_shortest_way():
@@ -190,30 +238,27 @@ def test_an_mv_outside_its_limits_may_return_the_shortest_way():
     t = make_tuning(
         s, cv_weight=1.0, move_weight=1.0, mv_low=0.0, mv_high=100.0, move_low=-2.0, move_high=2.0
     )
-    qp = condense(s, t, jnp.ones((2, 2, 5)))
-    zero = jnp.zeros((15, 2))
-    instance = make_instance(
-        s,
-        t,
-        qp,
-        free_response=zero,
-        setpoint=zero,
-        mv_now=jnp.asarray([106.0, 103.0]),
-        last_move=jnp.zeros(2),
-        recover=True,
-    )
+    posed = steady(s, t, mv_now=[106.0, 103.0], recover=True)
+    instance, rows = posed.instance, posed.size.rows
     assert np.array_equal(instance.row_high[:5], [-1, -2, -3, -3, -3])  # steps of 2 %
-    lift = instance.row_high[5 + 4 : 5 + 4 + 5] * 2.0
+    lift = instance.row_high[rows : rows + 5] * 2.0
     np.testing.assert_allclose(lift, [-2, -3, -3, -3, -3])
 
 
 def test_batched_weights_share_one_program():
     s = structure()
-    make = lambda w: condense(s, make_tuning(s, cv_weight=1.0, move_weight=1.0), jnp.ones((2, 2, 5)) * w)  # noqa: E731
-    both = jax.vmap(make)(jnp.asarray([1.0, 2.0]))
+    size, tuning = Size.of(s, 5), make_tuning(s, cv_weight=1.0, move_weight=1.0)
+    layout = layout_of(s, size)
+    ones = jnp.ones((2, 2, size.future))
+
+    def make(gain):
+        return condense(layout, size, tuning, matrices_of(layout, size, gain * ones))
+
+    both = jax.jit(jax.vmap(make))(jnp.asarray([1.0, 2.0]))
     np.testing.assert_allclose(
-        both.theta[1][:26], 2.0 * both.theta[0][:26] * (both.scale[1] / both.scale[0]), rtol=1e-12
+        both.theta[1], 2.0 * both.theta[0] * (both.scale[1] / both.scale[0]), rtol=1e-12
     )
+    assert np.abs(both.theta[0]).max() > 0.0
 
 
 @pytest.mark.parametrize(
@@ -239,7 +284,10 @@ def test_a_bad_structure_names_the_field(changes, field):
 def test_tunings_share_the_response_of_their_model():
     """A vmap over tunings alone leaves what the Newton matrices are made of without a batch axis."""
     s = structure()
-    coefficients = jnp.asarray(np.random.default_rng(7).normal(size=(2, 2, 9)))
+    size = Size.of(s, 9)
+    layout = layout_of(s, size)
+    coefficients = jnp.asarray(over(np.random.default_rng(7).normal(size=(2, 2, 9)), size.future))
+    matrices = matrices_of(layout, size, coefficients)
 
     def constants(weight, limit):
         tuning = make_tuning(
@@ -248,14 +296,13 @@ def test_tunings_share_the_response_of_their_model():
         tuning = dataclasses.replace(
             tuning, cv_weight=weight * tuning.cv_weight, move_high=limit * tuning.move_high
         )
-        qp = condense(s, tuning, coefficients)
+        qp = condense(layout, size, tuning, matrices)
         return (qp.response, qp.summed), qp.scale, qp.theta
 
     # `out_axes=None` is refused for anything that has a batch axis
-    over = jax.vmap(constants, in_axes=(0, 0), out_axes=(None, 0, 0))
-    (response, summed), scale, theta = over(jnp.asarray([1.0, 3.0]), jnp.asarray([1.0, 2.0]))
-    assert response.shape == (30 + 5, 10)
-    assert np.shape(summed) == (30, 55)
+    over_tunings = jax.jit(jax.vmap(constants, in_axes=(0, 0), out_axes=(None, 0, 0)))
+    (response, summed), scale, theta = over_tunings(jnp.asarray([1.0, 3.0]), jnp.asarray([1.0, 2.0]))
+    assert response.shape == (size.cvs * size.horizon, size.moves)
+    assert np.shape(summed) == (size.cvs * size.horizon, size.moves * (size.moves + 1) // 2)
     assert not np.allclose(scale[0], scale[1])
     np.testing.assert_allclose(theta[1], response * scale[1], rtol=1e-15)
-    np.testing.assert_array_equal(theta[1][30:, :5], np.eye(5))

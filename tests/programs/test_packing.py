@@ -4,14 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.controller.batch import Lanes
+from jaxmpc.programs.lanes import Lanes
 from jaxmpc.programs.packing import Packing, flattened, rebuilt
 from jaxmpc.relaxed.newton import WarmStart
+
+SHAPES = ((4,), (7,), (2, 4), (6,), (4,), (2,))  # of moves and prices
 
 
 def tree():
     rng = np.random.default_rng(0)
-    start = WarmStart(*(rng.normal(size=(3, n)) for n in (4, 7, 6, 4, 2)))
+    start = WarmStart(*(rng.normal(size=(3, *shape)) for shape in SHAPES))
     return start, {"status": np.array([0, 3, 1], dtype=np.int32), "good": np.array([True, False, True])}
 
 
@@ -44,7 +46,7 @@ def test_packings_of_equal_shapes_are_one_static_argument():
 
 
 def test_a_module_taken_apart_is_the_same_module_and_its_form_a_static_argument():
-    each = WarmStart(*(np.full(n, 1.0) for n in (4, 7, 6, 4, 2)))
+    each = WarmStart(*(np.full(shape, 1.0) for shape in SHAPES))
     other = jax.tree.map(lambda v: 2.0 * v, each)
     (leaves, form), (others, same) = (flattened(Lanes(own, (None, "shared"))) for own in (each, other))
     assert form == same  # arrays are not part of it

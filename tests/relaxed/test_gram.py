@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmpc.relaxed.gram import at_once, gram, one_by_one, running_sums
+from jaxmpc.problem.gram import at_once, gram, one_by_one, running_sums
 
 CVS, SAMPLES, MOVES = 3, 40, 7
 

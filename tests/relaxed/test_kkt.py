@@ -2,23 +2,19 @@
 
 import dataclasses
 
-import clarabel
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import piqp
 import pytest
-import scipy.sparse as sp
 
 from jaxmpc import status
-from jaxmpc.controller.case import make_case
-from jaxmpc.problem.blocking import hard_rows
-from jaxmpc.problem.condense import condense, make_instance
-from jaxmpc.relaxed.kkt import KktResiduals, kkt_residuals
-from jaxmpc.relaxed.problem import QpSolution, evaluate
+from jaxmpc.relaxed.problem import evaluate
 from jaxmpc.relaxed.solve import solve_relaxed
 from tests import problems
+from tests.oracles.foreign import foreign_solution, solution_of
+from tests.oracles.kkt import KktResiduals, kkt_residuals
+from tests.posed import pose_case, solve_one
 
 FIELDS = tuple(field.name for field in dataclasses.fields(KktResiduals))
 SHAPES = {
@@ -58,27 +54,11 @@ SHAPELESS = (  # twists that change numbers, never a shape, and leave a feasible
 )
 
 
-def relaxed(body: dict):
+def relaxed(body: dict, envelope: int | None = None):
     """Constant part, hard rows and instance of a case."""
-    case = make_case(body)
-    structure = case.structure
-    qp = condense(
-        structure,
-        case.tuning,
-        case.model.coefficients,
-        envelope=int(bool(structure.integer_mvs)),
-        summed=False,
-    )
-    instance = make_instance(
-        structure,
-        case.tuning,
-        qp,
-        free_response=jnp.asarray(case.free_response),
-        setpoint=jnp.asarray(case.setpoint),
-        mv_now=jnp.asarray(case.mv_now),
-        last_move=jnp.asarray(case.last_move),
-    )
-    return qp, hard_rows(structure), instance
+    levels = int(bool(body["structure"]["integer_step"])) if envelope is None else envelope
+    posed = pose_case(body, envelope=levels, summed=False)
+    return posed.qp, posed.rows, posed.instance
 
 
 def stacked(bodies):
@@ -91,18 +71,18 @@ def stacked(bodies):
 @eqx.filter_jit
 def solve_and_judge(qps, rows, instances):
     def one(qp, instance):
-        solution = solve_relaxed(qp, rows, instance, instance.lower, instance.upper)
+        solution = solve_relaxed(qp, instance, instance.lower, instance.upper)
         return solution, kkt_residuals(qp, rows, instance, solution)
 
     return eqx.filter_vmap(one)(qps, instances)
 
 
-solve_one = eqx.filter_jit(solve_relaxed)
+_residuals = jax.jit(kkt_residuals)
 
 
 def judge(qp, rows, instance, solution, **limits) -> dict[str, float]:
     """The five residuals by name."""
-    found = kkt_residuals(qp, rows, instance, solution, **limits)
+    found = _residuals(qp, rows, instance, solution, **limits)
     return {name: float(getattr(found, name)) for name in FIELDS}
 
 
@@ -118,7 +98,7 @@ def test_solved_problems_with_known_optima_have_small_residuals(shape):
     assert np.asarray(residuals.worst).max() <= 1e-6
     scale = np.asarray(qps.scale)
     for lane, (_, plan) in enumerate(cases):
-        known = jnp.asarray(plan.T.ravel() / scale[lane])
+        known = jnp.asarray(plan.T.ravel() / scale[lane])  # four blocks are a rung: nothing is padded
         qp, instance = jax.tree.map(lambda leaf, k=lane: leaf[k], (qps, instances))
         value = float(evaluate(qp, instance, known))
         assert float(solution.objective[lane]) == pytest.approx(value, rel=1e-6)
@@ -164,14 +144,15 @@ def _lane(tree, k):
 
 # ---------------------------------------------------------------------------------- a solution without a solver
 
-FIXED, AT_UPPER, FREE = 0, 1, 2  # what the first moves of the constructed solution are
+# what some moves of the constructed solution are; the last two have an envelope, and one of them is at its kink
+FIXED, AT_UPPER, FREE, AT_KINK, SLOPED = 0, 1, 2, 5, 6
 
 
 @pytest.fixture(scope="module")
 def constructed():
     """A problem built around moves and prices that are drawn, so that they solve it exactly; all kinds of terms."""
     rng = np.random.default_rng(11)
-    qp, rows, instance = relaxed(problems.small_case(rng, **SHAPES["moves"]))
+    qp, rows, instance = relaxed(problems.small_case(rng, **SHAPES["moves"]), envelope=2)
     theta, n, predictions = np.asarray(qp.theta), qp.theta.shape[1], len(qp.theta)
     horizon = predictions // 2
     bend, jump, c = (np.asarray(v) for v in (qp.soft_quadratic, qp.soft_linear, qp.deadzone))
@@ -186,7 +167,7 @@ def constructed():
     high, low = np.full(predictions, np.inf), np.full(predictions, -np.inf)
     high[:horizon] = t[:horizon].max() + c[0]
     high[[2, 5]] = t[[2, 5]] - 0.3 * c[0]
-    low[horizon:] = t[horizon:].min() - c[-1]
+    low[horizon:] = t[horizon:].min() - c[horizon]
     low[horizon + 3] = t[horizon + 3]
     limit_price = np.zeros(predictions)
     limit_price[2], limit_price[5] = 0.4 * rho[0], 0.6 * rho[0]
@@ -197,6 +178,15 @@ def constructed():
     force = (2 * np.asarray(qp.quadratic) * t + row_price + limit_price) @ theta + hard_price @ rows
     move_weight = rng.uniform(0.5, 2.0, n) * np.abs(force).max()
     x = -force / (2 * move_weight)  # a free move balances the other forces
+    steep, envelope_price = np.zeros((2, n)), np.zeros((2, n))
+    x[AT_KINK], steep[0, AT_KINK], envelope_price[0, AT_KINK] = (
+        0.0,
+        2.0 * abs(force[AT_KINK]),
+        -force[AT_KINK],
+    )
+    # half of the force is taken by the slope, which the second level leaves alone: the move is less than one step
+    x[SLOPED], steep[:, SLOPED] = 0.5 * x[SLOPED], 0.5 * abs(force[SLOPED])
+    envelope_price[0, SLOPED] = -0.5 * force[SLOPED]
     lower, upper, low_price, high_price = x - 1.0, x + 1.0, np.zeros(n), np.zeros(n)
     lower[FREE], upper[FREE] = -np.inf, np.inf
     for j in (FIXED, AT_UPPER):
@@ -206,24 +196,16 @@ def constructed():
     w = rows @ x
     row_low, row_high = w - 1.0, w + 1.0
     row_high[1], row_low[2], row_high[3] = w[1], -np.inf, np.inf
-    qp = eqx.tree_at(lambda q: q.move_weight, qp, jnp.asarray(move_weight))
+    weights = jnp.asarray(move_weight), jnp.asarray(steep)
+    qp = eqx.tree_at(lambda q: (q.move_weight, q.steep), qp, weights)
     values = (t - theta @ x, high, low, lower, upper, row_low, row_high)
     instance = eqx.tree_at(
         lambda i: (i.offset, i.limit_high, i.limit_low, i.lower, i.upper, i.row_low, i.row_high),
         instance,
         tuple(jnp.asarray(v) for v in values),
     )
-    solution = solution_of(x, row_price, limit_price, low_price, high_price, np.zeros(len(rows)), hard_price)
-    return qp, rows, instance, solution
-
-
-def solution_of(x, row, limit, lower, upper, row_low, row_high) -> QpSolution:
-    """Moves and prices alone; everything that a solver would say of itself is not a number."""
-    nothing = jnp.asarray(jnp.nan)
-    as_arrays = (jnp.asarray(v, dtype=float) for v in (row, limit, lower, upper, row_low, row_high))
-    return QpSolution(
-        jnp.asarray(x, dtype=float), nothing, nothing, jnp.asarray(-1), jnp.asarray(0), *as_arrays, nothing
-    )
+    prices = row_price, envelope_price, limit_price, low_price, high_price, np.zeros(len(rows)), hard_price
+    return qp, rows, instance, solution_of(x, *prices)
 
 
 def test_a_constructed_solution_has_no_residual_but_rounding(constructed):
@@ -306,6 +288,25 @@ def test_a_row_price_outside_the_subdifferential_is_seen(constructed):
     assert judge(flat, rows, instance, edge)["dual"] > 1e-6
 
 
+def test_an_envelope_price_outside_the_subdifferential_is_seen(constructed):
+    qp, rows, instance, solution = constructed
+    kink, slope = float(qp.steep[0, AT_KINK]), float(qp.steep[0, SLOPED])
+    greedy = judge(qp, rows, instance, add("envelope_price", (0, AT_KINK), 3.0 * kink)(solution))
+    assert greedy["dual"] > 1e-5
+    # at the kink any price up to the slope is right but for the gradient
+    shifted = judge(qp, rows, instance, add("envelope_price", (0, AT_KINK), 0.2 * kink)(solution))
+    assert shifted["dual"] == 0.0
+    assert shifted["complementarity"] < 1e-12
+    assert shifted["stationarity"] > 1e-5
+    toward = float(jnp.sign(solution.envelope_price[0, SLOPED]))
+    for level, amount in ((0, -0.5), (1, 0.5)):  # a slope that is not paid, and one that is not reached
+        wrong = judge(
+            qp, rows, instance, add("envelope_price", (level, SLOPED), amount * toward * slope)(solution)
+        )
+        assert wrong["dual"] == 0.0
+        assert wrong["complementarity"] > 1e-6
+
+
 def test_limit_prices_beyond_rho_or_of_no_limit_are_seen(constructed):
     qp, rows, instance, solution = constructed
     rho, horizon = np.asarray(qp.slack_weight), len(qp.theta) // 2
@@ -344,84 +345,6 @@ def test_what_is_not_a_number_is_never_small(constructed):
 # -------------------------------------------------------------------------------------------- other people's
 
 
-def inequalities(qp, rows, instance):
-    """The problem with its slacks: min z'Pz/2 + q'z, Gz <= h, over moves, eta and eps; and whose row is which."""
-    theta, t0 = np.asarray(qp.theta), np.asarray(instance.offset)
-    count, n, predictions = len(theta), theta.shape[1], len(instance.limit_high)
-    cvs = len(qp.slack_weight)
-    smooth = 2 * theta.T @ (np.asarray(qp.quadratic)[:, None] * theta) + 2 * np.diag(qp.move_weight)
-    P = sp.block_diag(
-        [smooth, sp.diags(2 * np.asarray(qp.soft_quadratic)), sp.csc_matrix((2 * cvs, 2 * cvs))]
-    )
-    rho = np.asarray(qp.slack_weight)
-    q = np.r_[2 * (np.asarray(qp.quadratic) * t0) @ theta, np.asarray(qp.soft_linear), rho, rho]
-    eta, none = sp.identity(count), sp.csr_matrix((count, 2 * cvs))
-    member = sp.csr_matrix(np.repeat(np.eye(cvs), predictions // cvs, axis=0))
-    no_eta, no_member = sp.csr_matrix((predictions, count)), sp.csr_matrix(member.shape)
-    c, y = np.asarray(qp.deadzone), theta[:predictions]
-    soft_x = sp.csr_matrix((2 * cvs, n + count))
-    wide = lambda a: sp.hstack([a, sp.csr_matrix((a.shape[0], count + 2 * cvs))])  # noqa: E731
-    free = sp.identity(n)
-    parts = {
-        "above": (sp.hstack([theta, -eta, none]), c - t0),
-        "below": (sp.hstack([-theta, -eta, none]), c + t0),
-        "eta": (sp.hstack([sp.csr_matrix((count, n)), -eta, none]), np.zeros(count)),
-        "high": (
-            sp.hstack([y, no_eta, -member, no_member]),
-            np.asarray(instance.limit_high) - t0[:predictions],
-        ),
-        "low": (
-            sp.hstack([-y, no_eta, no_member, -member]),
-            t0[:predictions] - np.asarray(instance.limit_low),
-        ),
-        "eps": (sp.hstack([soft_x, -sp.identity(2 * cvs)]), np.zeros(2 * cvs)),
-        "lower": (wide(-free), -np.asarray(instance.lower)),
-        "upper": (wide(free), np.asarray(instance.upper)),
-        "row_low": (wide(-sp.csr_matrix(rows)), -np.asarray(instance.row_low)),
-        "row_high": (wide(sp.csr_matrix(rows)), np.asarray(instance.row_high)),
-    }
-    return sp.csc_matrix(P), q, parts
-
-
-def foreign_solution(qp, rows, instance, solver: str) -> QpSolution:
-    """Moves and prices from a general QP solver."""
-    P, q, parts = inequalities(qp, rows, instance)
-    G = sp.vstack([matrix for matrix, _ in parts.values()], format="csr")
-    h = np.concatenate([bound for _, bound in parts.values()])
-    keep = np.isfinite(h)
-    z, dual = {"clarabel": by_clarabel, "piqp": by_piqp}[solver](P, q, G[keep].tocsc(), h[keep])
-    prices = np.zeros(len(h))
-    prices[keep] = dual
-    ends = np.cumsum([len(bound) for _, bound in parts.values()])
-    p = dict(zip(parts, np.split(prices, ends[:-1]), strict=True))
-    return solution_of(
-        z[: qp.theta.shape[1]],
-        p["above"] - p["below"],
-        p["high"] - p["low"],
-        *(p[name] for name in ("lower", "upper", "row_low", "row_high")),
-    )
-
-
-def by_clarabel(P, q, G, h):
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-11
-    cones = [clarabel.NonnegativeConeT(len(h))]
-    found = clarabel.DefaultSolver(sp.triu(P, format="csc"), q, G, h, cones, settings).solve()
-    assert str(found.status) in ("Solved", "AlmostSolved")
-    return np.array(found.x), np.array(found.z)
-
-
-def by_piqp(P, q, G, h):
-    solver = piqp.SparseSolver()
-    solver.settings.eps_abs = solver.settings.eps_rel = 1e-11
-    solver.settings.check_duality_gap = True
-    solver.settings.eps_duality_gap_abs = solver.settings.eps_duality_gap_rel = 1e-11
-    solver.setup(P, q, None, None, G, np.full(len(h), -np.inf), h)
-    assert solver.solve() == piqp.PIQP_SOLVED
-    return np.array(solver.result.x), np.array(solver.result.z_u)
-
-
 @pytest.mark.parametrize("solver", ["clarabel", "piqp"])
 @pytest.mark.parametrize("name", ["plain", "active_cv_limits", "heavy_soft_linear", "mv_held_by_limits"])
 def test_moves_and_prices_of_other_solvers_have_small_residuals_and_the_same_objective(solver, name):
@@ -434,5 +357,5 @@ def test_moves_and_prices_of_other_solvers_have_small_residuals_and_the_same_obj
         theirs = foreign_solution(qp, rows, instance, solver)
         residuals = judge(qp, rows, instance, theirs)
         assert max(residuals.values()) <= 1e-6, residuals
-        ours = solve_one(qp, rows, instance, instance.lower, instance.upper)
+        ours = solve_one(qp, instance)
         assert float(evaluate(qp, instance, theirs.x)) == pytest.approx(float(ours.objective), rel=1e-6)

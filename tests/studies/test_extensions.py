@@ -11,8 +11,7 @@ from figures.registry import FIGURES
 from identify.schedule import both_ways, identify_schedule
 from identify.step_test import identify_step_response
 from jaxmpc import status
-from jaxmpc.controller.continuous import ContinuousController
-from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
 from jaxmpc.problem.tuning import make_tuning
 from jaxmpc.process.plant import WellPlant
@@ -24,7 +23,6 @@ from studies.thesis import catalogue, report, time_limits
 
 AT = np.array([11000.0, 185.0]), np.array([50.0, 7500.0])  # CVs, MVs
 KINDS = pytest.mark.parametrize("integer", [False, True], ids=["continuous", "mixed-integer"])
-STEP = eqx.filter_jit(lambda controller, *arguments: controller.step(*arguments))
 
 
 @pytest.mark.parametrize("quick", [False, True])
@@ -51,20 +49,15 @@ def predictive(structure, fields, model, integer, **changes):
     shape = dataclasses.replace(structure, mean_move_mode="predictive", mean_move_window=5)
     shape = shape if integer else shape.relaxed()
     fields = fields | {"mean_move_limit": [0.55, None]} | changes
-    if integer:
-        return MixedIntegerController(
-            shape, make_tuning(shape, **fields, oscillation_rows={"choke": True}), model
-        )
-    return ContinuousController(shape, make_tuning(shape, **fields), model)
+    rows = {"oscillation_rows": {"choke": True}} if integer else {}
+    return Controller(shape, make_tuning(shape, **fields, **rows), model)
 
 
 def moves_of(controller, state, samples=20):
     """Choke moves towards a setpoint that asks for as much choke as there is; every sample has a plan."""
     moves = []
     for _ in range(samples):
-        arguments = (state, AT[0], AT[0] + np.array([4000.0, 60.0]))
-        integer = isinstance(controller, MixedIntegerController)
-        state, info = controller.step(*arguments) if integer else STEP(controller, *arguments)
+        state, info = controller.step(state, AT[0], AT[0] + np.array([4000.0, 60.0]))
         assert int(info.status) == status.OPTIMAL
         moves.append(float(info.move[0]))
     return np.array(moves)
@@ -84,7 +77,10 @@ def test_a_window_that_is_exceeded_already_leaves_a_plan_and_comes_back_to_its_l
     small_structure, thesis_fields, well_like_model, integer
 ):
     controller = predictive(small_structure, thesis_fields, well_like_model, integer)
-    state = eqx.tree_at(lambda s: s.past_moves, controller.init(*AT), np.tile([2.0, 0.0], (5, 1)))
+    state = controller.init(*AT)
+    past = np.zeros_like(state.past_moves)
+    past[-5:, 0] = 2.0
+    state = eqx.tree_at(lambda s: s.past_moves, state, past)
     moves = np.concatenate([np.full(5, 2.0), moves_of(controller, state)])
     means = np.convolve(moves, np.ones(5) / 5, "valid")
     assert moves[5] <= 1e-6

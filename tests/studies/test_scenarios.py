@@ -2,18 +2,18 @@
 
 import dataclasses
 
+import jax
 import msgspec
 import numpy as np
 import pytest
 import xarray as xr
 
 from identify.step_test import identify_step_response
-from jaxmpc.controller.continuous import ContinuousController
-from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.controller.controller import Controller
+from jaxmpc.controller.plan import Planner
 from jaxmpc.errors import InputError
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import simulate
-from jaxmpc.problem.condense import dynamic_matrix
 from jaxmpc.process.plant import WellPlant
 from studies.definition import comparison as definition
 from studies.definition import presets
@@ -28,7 +28,7 @@ GAS_OFF = {
     "soft_quadratic": {"gas_rate": 0.0, "oil_rate": 0.1},
     "soft_linear": {"gas_rate": 0.0, "oil_rate": 0.1},
 }
-KINDS = {ContinuousController: "continuous", MixedIntegerController: "step"}
+KINDS = {"continuous": "continuous", "mixed-integer": "step"}  # of the controller and of the choke
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +37,8 @@ def model():
 
 
 def controller_of(kind, model, changes=None):
-    structure = presets.structure(integer=kind is MixedIntegerController)
-    return kind(structure, presets.tuning(structure, changes=changes), model)
+    structure = presets.structure(integer=kind == "mixed-integer")
+    return Controller(structure, presets.tuning(structure, changes=changes), model)
 
 
 def run(kind, model, **how):
@@ -60,7 +60,7 @@ def test_an_equal_controller_that_takes_over_changes_nothing(model, kind):
 
 
 def test_a_controller_that_takes_over_goes_on_from_the_state_of_the_one_before(model):
-    kind = MixedIntegerController
+    kind = "mixed-integer"
     other = controller_of(kind, model, GAS_OFF)
     # the first sample after 195 s starts at 200 s; the other change comes later, and both loops then go sample by sample
     changed, alone = (run(kind, model, changes=[(time, other)]) for time in (195.0, 385.0))
@@ -76,7 +76,7 @@ def test_a_controller_that_takes_over_goes_on_from_the_state_of_the_one_before(m
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_open_loop_carries_out_its_plan_and_then_holds(model, kind):
-    structure = presets.structure(integer=kind is MixedIntegerController)
+    structure = presets.structure(integer=kind == "mixed-integer")
     short = Reference([0.0, 50.0], [[11013.0, 185.0], [12600.0, 175.0]], 2300.0)
     how = dict(open_loop_from=50.0, keep_plans=True)
     drop = np.where(np.arange(230) > 20, -3.0, 0.0)
@@ -102,14 +102,12 @@ def test_an_open_loop_carries_out_its_plan_and_then_holds(model, kind):
 
 
 def test_plans_are_kept_only_where_they_are_asked_for(model):
-    kept = run(MixedIntegerController, model)
+    kept = run("mixed-integer", model)
     assert kept.plan.shape == (40, 16, 2)
     np.testing.assert_allclose(kept.plan[:, 0], kept.move, atol=1e-9)
-    plain = simulate(
-        controller_of(MixedIntegerController, model), WellPlant(actuator="step"), STEP, samples=8
-    )
+    plain = simulate(controller_of("mixed-integer", model), WellPlant(actuator="step"), STEP, samples=8)
     assert plain.plan is None
-    compiled = run(ContinuousController, model)
+    compiled = run("continuous", model)
     np.testing.assert_allclose(compiled.plan[:, 0], compiled.move, atol=1e-3)
 
 
@@ -128,13 +126,13 @@ def test_plans_are_kept_only_where_they_are_asked_for(model):
     ],
 )
 def test_interventions_that_do_not_fit_are_refused_before_the_run(model, how, field):
-    same = controller_of(ContinuousController, model)
+    same = controller_of("continuous", model)
     structure = presets.structure()
     longer = dataclasses.replace(model, coefficients=model.extended(300))
     others = {
         None: lambda: same,
-        "other structure": lambda: controller_of(MixedIntegerController, model),
-        "longer model": lambda: ContinuousController(structure, presets.tuning(structure), longer),
+        "other structure": lambda: controller_of("mixed-integer", model),
+        "longer model": lambda: Controller(structure, presets.tuning(structure), longer),
     }
     given = {**how, "changes": [(time, others[name]()) for time, name in how.get("changes", ())]}
     with pytest.raises(InputError) as error:
@@ -272,19 +270,22 @@ def planned(model, tmp_path_factory):
 def test_a_stored_plan_predicts_what_its_controller_predicted(model, planned, i):
     study, data = planned
     one = study.controllers[i]
-    kind = MixedIntegerController if one.kind == "mixed-integer" else ContinuousController
-    controller = kind(one.structure(), one.build_tuning(), model)
-    theta = np.asarray(dynamic_matrix(one.structure(), model.coefficients))
+    controller = Controller(one.structure(), one.build_tuning(), model)
+    theta = Planner(one.structure(), one.build_tuning(), model).matrix
+    blocks, horizon = one.structure().block_count, one.structure().prediction_horizon
+    core, unknown, nobody = controller.core, np.full(2, np.nan), np.zeros(2, dtype=bool)
+    observe = jax.jit(lambda *given: core.observe(*given))
+    remember = jax.jit(lambda *given: core.remember(*given))
     run = data.sel(controller=one.name)
     mv = run.demand.values[0] - run.move.values[0]
     state = controller.init(run.measurement.values[0], mv)
     for k in range(data.sizes["time"]):
-        state, free_response = controller.memory.observe(state, run.measurement.values[k])
+        state, free_response = observe(state, run.measurement.values[k], unknown, nobody)
         moves = run.plan.values[k]
-        state = controller.memory.remember(state, run.move.values[k], moves, state.warm)
+        state = remember(state, np.pad(moves, [(0, core.size.blocks - blocks), (0, 0)]), state.warm)
         if k % 6:
             continue
-        predicted = np.asarray(free_response) + np.einsum("chmb,bm->hc", theta, moves)
+        predicted = np.asarray(free_response)[:horizon] + np.einsum("chmb,bm->hc", theta, moves)
         plan = plans.plan_at(data, one.name, data.time.values[k])
         np.testing.assert_allclose(plan.cv, predicted, atol=1e-8)
         assert plan.move.shape == plan.mv.shape == (200, 2)

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from jaxmpc import simulate, stack_tunings
-from jaxmpc.controller.continuous import ContinuousController
-from jaxmpc.controller.mixed_integer import MixedIntegerController
+from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.loop.trajectory import TrajectoryBatch
 from jaxmpc.process.plant import WellPlant
@@ -89,9 +88,8 @@ def hazard(monkeypatch, tmp_path):
 
 def alone(scenario, models):
     """The scenario run by itself: trajectory and key figures."""
-    kind = MixedIntegerController if scenario.kind == "mixed-integer" else ContinuousController
     found = simulate(
-        kind(scenario.structure, scenario.tuning, models[scenario.model_point]),
+        Controller(scenario.structure, scenario.tuning, models[scenario.model_point]),
         WellPlant(parameters=scenario.plant, actuator=scenario.actuator),
         scenario.reference,
         samples=scenario.samples,

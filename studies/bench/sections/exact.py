@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.controller.continuous import shift_plan
-from jaxmpc.controller.mixed_integer import MixedIntegerController
-from jaxmpc.controller.plan import Plan
+from jaxmpc.controller.plan import Plan, Planner
 from jaxmpc.relaxed.solve import shifted_start
 from studies.bench import forms
 from studies.bench.beside import Contest
@@ -63,10 +60,11 @@ def _enter_ours(contest: Contest, mode: Mode, instances: Instances) -> None:
     for finish, label in WAYS.items():
         contest.context.say(f"{contest.name}: {label}")
         controller = make_controller("mixed-integer", mode, instances.model)
-        problems = [_as_in_the_loop(controller, instances, i) for i in range(len(instances))]
+        planner = Planner(controller.structure, controller.tuning, controller.model)
+        problems = [_as_in_the_loop(planner, instances, i) for i in range(len(instances))]
         limits = {"gap": GAP, "finish": finish, "time_limit": PATIENCE}
 
-        def solve(problem: dict[str, Any], planner=controller.planner, limits=limits) -> Plan:
+        def solve(problem: dict[str, Any], planner=planner, limits=limits) -> Plan:
             return planner.solve(**problem, **limits)
 
         for problem in problems:  # compiles every form that these problems meet
@@ -75,15 +73,16 @@ def _enter_ours(contest: Contest, mode: Mode, instances: Instances) -> None:
         contest.enter(finish, seconds, [plan.moves if plan.status == "optimal" else None for plan in plans])
 
 
-def _as_in_the_loop(controller: MixedIntegerController, instances: Instances, i: int) -> dict[str, Any]:
+def _as_in_the_loop(planner: Planner, instances: Instances, i: int) -> dict[str, Any]:
     """Arguments of `Planner.solve`, with the plan and the prices of one sample earlier as the loop has them."""
-    structure = controller.structure
-    earlier = controller.planner.solve(**instances.before.at(i), recover=True, gap=GAP, time_limit=PATIENCE)
+    structure = planner.structure
+    earlier = planner.solve(**instances.before.at(i), recover=True, gap=GAP, time_limit=PATIENCE)
     start: dict[str, Any] = {}
     if earlier.moves is not None:
-        start["previous_moves"] = np.asarray(shift_plan(structure, jnp.asarray(earlier.moves)))
+        shift = np.asarray(planner.controllers.cores.shared.layout.shift)
+        start["previous_moves"] = shift[: structure.block_count, : structure.block_count] @ earlier.moves
     if earlier.warm is not None:
-        start["warm"] = shifted_start(earlier.warm, structure.cv_count, structure.horizon_count)
+        start["warm"] = shifted_start(earlier.warm, structure.cv_count)
     return {**instances.now.at(i), **start, "recover": True}
 
 

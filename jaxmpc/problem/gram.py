@@ -17,8 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-SUMMED_LIMIT = 64  # variables up to which running sums are worth their memory: rows x n(n+1)/2 numbers
-
 
 def running_sums(response: Float[Array, "prediction n"], cvs: int) -> Float[Array, "prediction pair"]:
     """Sums of the products of columns i <= j over the rows of each CV up to and including this one.

@@ -1,4 +1,4 @@
-"""Closed loops in strides: the same run as the loop that asks the host at every sample."""
+"""Closed loops in compiled calls of many samples: the same run as the loop that asks the host at every sample."""
 
 import numpy as np
 import pytest
@@ -6,16 +6,15 @@ import pytest
 from identify.step_test import identify_step_response
 from jaxmpc import status
 from jaxmpc.controller import measurement
-from jaxmpc.controller.mixed_integer import MixedIntegerController, MixedIntegerControllers
-from jaxmpc.loop import simulate as closed_loop
-from jaxmpc.loop import strides
+from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.loop import compiled
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import simulate, simulate_batch
 from jaxmpc.loop.trajectory import RECORDABLE
 from jaxmpc.process.plant import WellPlant
 from studies.definition import presets
 
-SAMPLES = 90  # more than two calls of the longest length
+SAMPLES = 90  # more than one call of the longest length
 PLANT = WellPlant(actuator="step")
 REFERENCE = Reference([0, 200], [[11013, 185], [9640, 152]], 10.0 * SAMPLES)
 
@@ -28,15 +27,15 @@ def model():
 def controller(model, blocking="moves", preset="thesis", **options):
     structure = presets.structure(blocking, integer=True)
     tuning = presets.tuning(structure, preset, {"measurement_low": {"gas_rate": None, "oil_rate": 20.0}})
-    return MixedIntegerController(structure, tuning, model, **options)
+    return Controller(structure, tuning, model, **options)
 
 
 def both(monkeypatch, made, **options):
-    """The run in strides, and sample by sample."""
-    in_strides = simulate(made, PLANT, REFERENCE, keep_plans=True, **options)
+    """The run in compiled calls, and sample by sample."""
+    together = simulate(made, PLANT, REFERENCE, keep_plans=True, **options)
     with monkeypatch.context() as patch:
-        patch.setattr(closed_loop, "able", lambda controllers: False)
-        return in_strides, simulate(made, PLANT, REFERENCE, keep_plans=True, **options)
+        patch.setattr(Controller, "compiled", False)
+        return together, simulate(made, PLANT, REFERENCE, keep_plans=True, **options)
 
 
 FAULTS = (
@@ -47,7 +46,7 @@ FAULTS = (
 
 
 @pytest.mark.parametrize("blocking", ["moves", "inputs"])
-def test_strides_give_the_run_of_single_steps(monkeypatch, model, blocking):
+def test_a_compiled_loop_gives_the_run_of_single_steps(monkeypatch, model, blocking):
     disturbance = np.where(np.arange(SAMPLES) > 40, -3.0, 0.0)
     made = controller(model, blocking)
     run, steps = both(
@@ -92,13 +91,13 @@ def test_a_run_shorter_than_one_call_has_its_own_length(model):
     np.testing.assert_array_equal(run.cv, whole.cv[:3])
 
 
-def test_a_controller_whose_finish_is_prescribed_is_stepped(monkeypatch, model):
-    def refuse(*_):
-        raise AssertionError("strides close samples by the relaxation")
-
-    monkeypatch.setattr(closed_loop, "simulate_in_strides", refuse)
-    run = simulate(controller(model, finish="branch-and-bound"), PLANT, REFERENCE, samples=3)
+def test_a_controller_whose_finish_is_prescribed_searches_by_it_alone(monkeypatch, model):
+    run, steps = both(monkeypatch, controller(model, finish="branch-and-bound"), samples=25)
     assert (run.status == status.OPTIMAL).all()
+    ways = {status.finisher_code(name) for name in ("relaxation", "branch-and-bound")}
+    assert set(run.finished_by.tolist()) == ways
+    np.testing.assert_array_equal(run.finished_by, steps.finished_by)
+    np.testing.assert_array_equal(run.mv_demand[:, 0], steps.mv_demand[:, 0])
 
 
 @pytest.mark.slow
@@ -109,11 +108,11 @@ def test_many_loops_do_not_depend_on_how_many_threads_and_parts_there_are(monkey
     tunings = [
         presets.tuning(structure, changes={"move_weight": {"choke": w, "gas_lift": 0.2}}) for w in weights
     ]
-    monkeypatch.setattr(strides, "TOGETHER", 2)
+    monkeypatch.setattr(compiled, "TOGETHER", 2)
     runs, seen = {}, []
     for threads in ("1", "3"):
         monkeypatch.setenv("JAXMPC_THREADS", threads)
-        controllers = MixedIntegerControllers(structure, tunings, [model])
+        controllers = Controllers(structure, tunings, [model])
         progress = lambda done, total: seen.append((done, total))  # noqa: E731
         runs[threads] = simulate_batch(controllers, PLANT, REFERENCE, samples=60, progress=progress)
         assert seen[-1] == (5 * 60, 5 * 60)
@@ -123,7 +122,7 @@ def test_many_loops_do_not_depend_on_how_many_threads_and_parts_there_are(monkey
         for field in RECORDABLE:
             if field != "solve_time":
                 np.testing.assert_array_equal(getattr(one, field), getattr(three, field), err_msg=field)
-        alone = simulate(MixedIntegerController(structure, tuning, model), PLANT, REFERENCE, samples=60)
+        alone = simulate(Controller(structure, tuning, model), PLANT, REFERENCE, samples=60)
         np.testing.assert_array_equal(alone.mv_demand[:, 0], one.mv_demand[:, 0])
         # sums are rounded in another order, and the loop feeds that back
         np.testing.assert_allclose(alone.cv, one.cv, rtol=1e-8)
@@ -131,10 +130,10 @@ def test_many_loops_do_not_depend_on_how_many_threads_and_parts_there_are(monkey
 
 
 def test_what_one_thread_raises_ends_all(monkeypatch, model):
-    monkeypatch.setattr(strides, "TOGETHER", 1)
+    monkeypatch.setattr(compiled, "TOGETHER", 1)
     monkeypatch.setenv("JAXMPC_THREADS", "2")
     structure = presets.structure("moves", integer=True)
-    controllers = MixedIntegerControllers(structure, [presets.tuning(structure)], [model], count=2)
+    controllers = Controllers(structure, [presets.tuning(structure)], [model], count=2)
 
     def interrupt(done, total):
         if done > 10:

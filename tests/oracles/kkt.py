@@ -4,13 +4,16 @@ Tests and benchmarks judge solvers with these, the library's own and foreign one
 prices, and nothing that a solver says of itself: objective, bound and status are not looked at, and no helper
 of the solvers is called. The problem is
 
-    min  sum Q t^2 + sum P x^2 + sum_k soft_k(t_k) + sum_g rho_g max(0, violation_g),    t = theta x + t0,
+    min  sum Q t^2 + sum P x^2 + sum_k soft_k(t_k) + sum_m b_m(x) + sum_g rho_g max(0, violation_g),    t = theta x + t0,
     lower <= x <= upper,    row_low <= W x <= row_high,
 
-with soft(t) = S e^2 + s e, e = max(|t| - c, 0), and one group g per CV and side. With a price v for every soft row, p for
-every CV limit, mu for every hard row and lambda for every limit of x, a solution has (Boyd and Vandenberghe 2004, 5.5.3)
+with soft(t) = S e^2 + s e, e = max(|t| - c, 0), the envelope b_m(x) = steep_m max(|x| - m, 0) of integer moves, and one
+group g per CV and side. With a price v for every soft row, w for every level of the envelope, p for every CV limit, mu for
+every hard row and lambda for every limit of x, a solution has (Boyd and Vandenberghe 2004, 5.5.3)
 
-    2 theta'Q t + 2 P x + theta'(v + p) + W'mu + lambda = 0,   v in the subdifferential of soft(t), ...
+    2 theta'Q t + 2 P x + theta'(v + p) + sum_m w_m + W'mu + lambda = 0,   v in the subdifferential of soft(t), ...
+
+The hard rows W are written out here, sample by sample; those of the library are products by structure.
 """
 
 from __future__ import annotations
@@ -22,7 +25,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxmpc.problem.condense import CondensedQp, QpInstance
+from jaxmpc.problem.condense import CondensedQp
+from jaxmpc.problem.instance import QpInstance
+from jaxmpc.problem.layout import Size
+from jaxmpc.problem.structure import Structure
 from jaxmpc.programs.numerics import largest
 from jaxmpc.relaxed.problem import QpSolution
 
@@ -41,10 +47,10 @@ class KktResiduals(eqx.Module):
         stationarity: largest component of the Lagrangian's gradient, over the force scale.
         primal: largest violation of the limits of x and of the hard rows, over max(1, |limit|).
         dual: largest price of the wrong sign, at an infinite limit, beyond s of a row with S = 0, or beyond rho of its CV
-            and side, each as the force it exerts, over the force scale.
+            and side, or beyond the slope of the envelope, each as the force it exerts, over the force scale.
         complementarity: largest product of price and distance to a limit, largest rho max(0, violation) - sum p violation
             of a CV and side, largest soft(t) + soft*(v) - v t of a row (Fenchel-Young: zero if and only if v is in the
-            subdifferential at t), over the cost scale.
+            subdifferential at t), and the same of the envelope, over the cost scale.
         gap: distance between the objective and the dual objective of these prices (Wolfe), over the cost scale.
     """
 
@@ -62,15 +68,44 @@ class KktResiduals(eqx.Module):
 
 
 class _Prices(eqx.Module):
-    """One non-negative vector per family of inequalities if the signs are right; v keeps its sign."""
+    """One non-negative vector per family of inequalities if the signs are right; v and w keep their signs."""
 
     row: Array
+    envelope: Array
     high: Array
     low: Array
     lower: Array
     upper: Array
     row_low: Array
     row_high: Array
+
+
+def dense_rows(structure: Structure, size: Size) -> Float[np.ndarray, "hard n"]:
+    """W, MV after MV: positions at the ends of blocks, differences of neighbouring moves, mean-move windows (6.6).
+
+    From the moves of the samples, one after the other. The last position is repeated where blocks are padding; rows of
+    padded windows are zero, and nothing limits a row of padding.
+    """
+    moves, blocks, mvs = np.zeros((structure.control_horizon, size.blocks)), size.blocks, size.mvs
+    ends = []
+    for b, length in enumerate(structure.blocks):
+        begin = sum(structure.blocks[:b])
+        moves[begin : begin + (length if structure.blocking == "moves" else 1), b] = 1.0
+        ends.append(begin + length - 1)
+    position, pair, window = (
+        np.zeros((blocks, blocks)),
+        np.zeros((blocks, blocks)),
+        np.zeros((size.windows, blocks)),
+    )
+    for b in range(blocks):
+        position[b] = moves[: ends[min(b, len(ends) - 1)] + 1].sum(axis=0)
+        pair[b, b] = 1.0
+        if b:
+            pair[b, b - 1] = -1.0
+    if structure.mean_move_mode == "predictive":
+        for k in range(structure.control_horizon):
+            window[k] = moves[max(k + 1 - structure.mean_move_window, 0) : k + 1].sum(axis=0)
+    return np.kron(np.eye(mvs), np.concatenate([position, pair, window]))
 
 
 def kkt_residuals(
@@ -85,22 +120,25 @@ def kkt_residuals(
 
     Args:
         qp: constant part.
-        rows: hard rows, `blocking.hard_rows(structure)`.
+        rows: hard rows, `dense_rows`.
         instance: offsets and limits of this sample.
         solution: its moves and prices; everything else in it is ignored.
         lower, upper: limits of x that were solved for; the instance's if not given. Equal limits fix a move.
     """
     lower = instance.lower if lower is None else lower
     upper = instance.upper if upper is None else upper
+    limit_price = solution.limit_price
     if not qp.has_limits:  # then the CV limits are no part of the problem
-        none = jnp.full_like(instance.limit_high, jnp.inf)
+        none = jnp.full_like(instance.offset, jnp.inf)
         instance = eqx.tree_at(lambda i: (i.limit_high, i.limit_low), instance, (none, -none))
+        limit_price = limit_price if limit_price.size else jnp.zeros_like(none)
     w_matrix, x = jnp.asarray(rows), solution.x
     t, wx = qp.theta @ x + instance.offset, w_matrix @ x
     prices = _Prices(
         row=solution.row_price,
-        high=jnp.maximum(solution.limit_price, 0.0),
-        low=jnp.maximum(-solution.limit_price, 0.0),
+        envelope=solution.envelope_price,
+        high=jnp.maximum(limit_price, 0.0),
+        low=jnp.maximum(-limit_price, 0.0),
         lower=solution.lower_price,
         upper=solution.upper_price,
         row_low=solution.row_low_price,
@@ -123,7 +161,10 @@ def kkt_residuals(
         primal=_largest(*(_over(room, limit) for _, room, limit in inequalities)),
         dual=_dual_infeasibility(qp, w_matrix, instance, prices, lower, upper) / force,
         complementarity=_largest(
-            *products, *_limit_products(qp, instance, t, prices), _fenchel_young(qp, t, prices.row)
+            *products,
+            *_limit_products(qp, instance, t, prices),
+            _fenchel_young(qp, t, prices.row),
+            _fenchel_young_of_envelope(qp, x, prices.envelope),
         )
         / cost,
         gap=jnp.abs(objective - _dual_objective(qp, instance, x, prices, lower, upper)) / cost,
@@ -161,15 +202,28 @@ def _fenchel_young(qp: CondensedQp, t, price):
     return _soft(qp, t) + _soft_conjugate(qp, price) - allowed * t
 
 
+def _knots(qp: CondensedQp) -> Float[np.ndarray, "level 1"]:
+    """Where the slopes of the envelope begin [steps]: 0, 1, 2, ..."""
+    return np.arange(float(qp.steep.shape[0]))[:, None]
+
+
+def _envelope(qp: CondensedQp, x) -> Float[Array, "level n"]:
+    return qp.steep * jnp.maximum(jnp.abs(x) - _knots(qp), 0.0)
+
+
+def _fenchel_young_of_envelope(qp: CondensedQp, x, price):
+    allowed = jnp.clip(price, -qp.steep, qp.steep)
+    return (_envelope(qp, x) + _knots(qp) * jnp.abs(allowed) - allowed * x).reshape(-1)
+
+
 def _per_group(qp: CondensedQp, values, reduce):
     return reduce(values.reshape(qp.slack_weight.shape[0], -1), axis=1)
 
 
 def _limit_products(qp: CondensedQp, instance: QpInstance, t, prices: _Prices):
     """Rho max(0, violation) - sum of price times violation, per CV, for the high and the low sides."""
-    y = t[: instance.limit_high.shape[0]]
     found = []
-    for price, over in ((prices.high, y - instance.limit_high), (prices.low, instance.limit_low - y)):
+    for price, over in ((prices.high, t - instance.limit_high), (prices.low, instance.limit_low - t)):
         paid = jnp.where(jnp.isfinite(over), price * over, 0.0)
         worst = jnp.maximum(_per_group(qp, over, jnp.max), 0.0)
         found.append(qp.slack_weight * worst - _per_group(qp, paid, jnp.sum))
@@ -178,8 +232,8 @@ def _limit_products(qp: CondensedQp, instance: QpInstance, t, prices: _Prices):
 
 def _objective(qp: CondensedQp, instance: QpInstance, x, t):
     value = jnp.sum(qp.quadratic * t**2) + jnp.sum(qp.move_weight * x**2) + jnp.sum(_soft(qp, t))
-    y = t[: instance.limit_high.shape[0]]
-    for over in (y - instance.limit_high, instance.limit_low - y):
+    value += jnp.sum(_envelope(qp, x))
+    for over in (t - instance.limit_high, instance.limit_low - t):
         value += qp.slack_weight @ jnp.maximum(_per_group(qp, over, jnp.max), 0.0)
     return value
 
@@ -187,12 +241,12 @@ def _objective(qp: CondensedQp, instance: QpInstance, x, t):
 def _dual_objective(qp: CondensedQp, instance: QpInstance, x, prices: _Prices, lower, upper):
     """The Lagrangian less its gradient times x: the dual objective where the gradient vanishes."""
     offset = instance.offset
-    y0 = offset[: instance.limit_high.shape[0]]
     value = jnp.sum(qp.quadratic * (offset**2 - (qp.theta @ x) ** 2)) - jnp.sum(qp.move_weight * x**2)
     value += jnp.sum(prices.row * offset - _soft_conjugate(qp, prices.row))
+    value -= jnp.sum(_knots(qp) * jnp.minimum(jnp.abs(prices.envelope), qp.steep))
     for price, constant in (
-        (prices.high, y0 - instance.limit_high),
-        (prices.low, instance.limit_low - y0),
+        (prices.high, offset - instance.limit_high),
+        (prices.low, instance.limit_low - offset),
         (prices.lower, lower),
         (prices.upper, -upper),
         (prices.row_low, instance.row_low),
@@ -210,7 +264,8 @@ def _forces(qp: CondensedQp, w_matrix, x, t, prices: _Prices) -> Float[Array, "t
             (2.0 * qp.quadratic * t) @ qp.theta,
             2.0 * qp.move_weight * x,
             prices.row @ qp.theta,
-            net @ qp.theta[: net.shape[0]],
+            jnp.sum(prices.envelope, axis=0),
+            net @ qp.theta,
             (prices.row_high - prices.row_low) @ w_matrix,
             prices.upper - prices.lower,
         ]
@@ -220,7 +275,8 @@ def _forces(qp: CondensedQp, w_matrix, x, t, prices: _Prices) -> Float[Array, "t
 def _cost_of_a_move(qp: CondensedQp) -> Float[Array, ""]:
     """What one scaled move costs at most, alone and away from every deadzone [objective]."""
     theta = jnp.abs(qp.theta)
-    return jnp.max((qp.quadratic + qp.soft_quadratic) @ theta**2 + qp.soft_linear @ theta + qp.move_weight)
+    bent = (qp.quadratic + qp.soft_quadratic) @ theta**2 + qp.move_weight
+    return jnp.max(bent + qp.soft_linear @ theta + jnp.sum(qp.steep, axis=0))
 
 
 def _dual_infeasibility(qp: CondensedQp, w_matrix, instance: QpInstance, prices: _Prices, lower, upper):
@@ -239,8 +295,8 @@ def _dual_infeasibility(qp: CondensedQp, w_matrix, instance: QpInstance, prices:
         wrong(prices.row_low, instance.row_low, hard),
         wrong(prices.row_high, instance.row_high, hard),
         jnp.where(qp.soft_quadratic > 0.0, 0.0, excess) * reach,
+        jnp.maximum(jnp.abs(prices.envelope) - qp.steep, 0.0).reshape(-1),
     ]
-    reach = reach[: instance.limit_high.shape[0]]
     for price, limit in ((prices.high, instance.limit_high), (prices.low, instance.limit_low)):
         beyond = jnp.maximum(_per_group(qp, price, jnp.sum) - qp.slack_weight, 0.0)
         found += [wrong(price, limit, reach), beyond * _per_group(qp, reach, jnp.max)]

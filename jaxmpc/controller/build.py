@@ -1,0 +1,228 @@
+"""Problems of controllers from structures, tunings and models: one, or many as lanes that share what they have in common."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from jaxmpc.controller.core import Core, may_switch
+from jaxmpc.errors import InputError
+from jaxmpc.integer.tables import INTEGERS, Constants, Tables
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.problem.condense import CondensedQp, Matrices, condense, matrices_of
+from jaxmpc.problem.layout import Layout, Size, layout_of, rung
+from jaxmpc.problem.memory import check_size
+from jaxmpc.problem.structure import Structure, check_match
+from jaxmpc.problem.tuning import Tuning, stack_tunings
+from jaxmpc.programs.lanes import Lanes, lanes_of
+
+AT_ONCE = 64  # lanes that are condensed together
+
+_matrices = jax.jit(matrices_of, static_argnames=("size", "summed"))
+_condense = jax.jit(condense, static_argnames=("size", "envelope", "has_limits"))
+
+
+@functools.partial(jax.jit, static_argnames=("size", "envelope", "has_limits"))
+def _condense_some(layouts: Lanes[Layout], size, tunings, matrices: Lanes[Matrices], envelope, has_limits):
+    """Problems of `AT_ONCE` lanes, without their responses."""
+
+    def lane(own_layout, tuning, own_matrices):
+        layout = eqx.combine(own_layout, layouts.shared)
+        given = eqx.combine(own_matrices, matrices.shared)
+        return _bare(condense(layout, size, tuning, given, envelope=envelope, has_limits=has_limits))
+
+    return jax.vmap(lane)(layouts.each, tunings, matrices.each)
+
+
+def _bare(qp: CondensedQp) -> CondensedQp:
+    return eqx.tree_at(lambda q: (q.response, q.summed), qp, (None, None), is_leaf=lambda v: v is None)
+
+
+class _Own(NamedTuple):
+    """What was given per scenario."""
+
+    structure: bool
+    tuning: bool
+    model: bool
+
+
+class Scenarios:
+    """What controllers are made of, checked: structures of one size, tunings and models, one for all or one per scenario.
+
+    Args:
+        structures: with CVs and MVs of the same names.
+        tunings: weights and limits.
+        models: step-response models.
+        count: number of scenarios where it does not follow.
+
+    Raises:
+        InputError: naming what does not fit.
+    """
+
+    def __init__(
+        self,
+        structures: Sequence[Structure],
+        tunings: Sequence[Tuning],
+        models: Sequence[StepResponseModel],
+        count: int | None = None,
+    ):
+        given = {"structure": len(structures), "tunings": len(tunings), "models": len(models)}
+        for name, number in given.items():
+            if not number:
+                raise InputError(name, "nothing", "one or more, one for all or one per scenario")
+        counts = {*given.values(), count or 1} - {1}
+        if len(counts) > 1:
+            raise InputError("tunings", given, "one for all or one per scenario")
+        first = structures[0]
+        for k, structure in enumerate(structures):
+            same = all(
+                getattr(first, key) == getattr(structure, key) for key in ("cv_names", "mv_names", "dt")
+            )
+            if not same:
+                found = f"{structure.mv_names} -> {structure.cv_names}, dt = {structure.dt} s"
+                raise InputError(
+                    f"structure[{k}]",
+                    found,
+                    f"{first.mv_names} -> {first.cv_names}, dt = {first.dt} s as the first",
+                )
+            check_size(structure)
+        for k, model in enumerate(models):
+            check_match(first, model, f"model[{k}]" if len(models) > 1 else "model")
+        self.count = counts.pop() if counts else 1
+        # what has lanes follows from what was given, not from its values: programs of the same form are the same
+        self.own = _Own(*(len(given) > 1 for given in (structures, tunings, models)))
+        one_each = lambda values: list(values) * self.count if len(values) == 1 else list(values)  # noqa: E731
+        self.structures, self.tunings, self.models = map(one_each, (structures, tunings, models))
+        pairs = {(s, m.samples) for s in set(structures) for m in models}
+        self.size = functools.reduce(lambda a, b: a | b, (Size.of(*pair) for pair in pairs))
+        most = max(len(s.integer_mvs) * s.block_count for s in structures)
+        self.integers = min(rung(most, INTEGERS), INTEGERS[-1]) if most else 0
+        self.has_limits = any(_limited(tuning) for tuning in tunings)
+        self.switching = any(may_switch(tuning) for tuning in tunings)
+
+    @property
+    def structure(self) -> Structure:
+        """The first, which names and sampling intervals are taken from."""
+        return self.structures[0]
+
+    @property
+    def lanes(self) -> bool:
+        """Whether anything was given per scenario."""
+        return any(self.own)
+
+    def _coefficients(self) -> list[Any]:
+        """Of the models, as long as the shift register."""
+        made = {id(model): model.extended(self.size.future) for model in self.models}
+        return [made[id(model)] for model in self.models]
+
+    def problems(self, envelope: int) -> Lanes[CondensedQp]:
+        """Constant parts of the problems, for integer moves of so many steps."""
+        size = self.size
+        options = dict(envelope=envelope if self.integers else 0, has_limits=self.has_limits)
+        made: dict[tuple[Structure, int], Matrices] = {}
+        own = self.own.structure or self.own.model
+        each = []
+        for structure, coefficients in zip(self.structures, self._coefficients(), strict=True):
+            key = structure, id(coefficients)
+            if key not in made:
+                # running sums take memory: every lane with its own response goes without
+                made[key] = _matrices(layout_of(structure, size), size, coefficients, summed=not own)
+            each.append(made[key])
+        if not self.lanes:
+            qp = _condense(layout_of(self.structure, size), size, self.tunings[0], each[0], **options)
+            return lanes_of([qp])
+        matrices = lanes_of(each if own else each[:1])
+        layouts, tunings = self.layouts(), stack_tunings(self.tunings)
+        found = []
+        for begin in range(0, self.count, AT_ONCE):
+            index = np.minimum(begin + np.arange(AT_ONCE), self.count - 1)
+            some = jax.tree.map(lambda v, i=index: np.asarray(v)[i], (layouts.each, tunings, matrices.each))
+            some_layouts, some_matrices = Lanes(some[0], layouts.shared), Lanes(some[2], matrices.shared)
+            qps = _condense_some(some_layouts, size, some[1], some_matrices, **options)
+            used = min(AT_ONCE, self.count - begin)
+            found.append(jax.tree.map(lambda v, u=used: np.asarray(v)[:u], qps))
+        joined = jax.tree.map(lambda *v: np.concatenate(v), *found)
+        responses = lambda q: (q.response, q.summed)  # noqa: E731
+        put = lambda qp, m: eqx.tree_at(responses, qp, (m.response, m.summed), is_leaf=lambda v: v is None)  # noqa: E731
+        nothing = jax.tree.map(lambda _: None, joined)
+        return Lanes(put(joined, matrices.each), put(nothing, matrices.shared))
+
+    def layouts(self) -> Lanes[Layout]:
+        """Structures as arrays."""
+        layouts = [layout_of(s, self.size) for s in self.structures]
+        return lanes_of(layouts if self.own.structure else layouts[:1])
+
+    def constants(self, qps: Lanes[CondensedQp]) -> list[Constants]:
+        """What searches need of the problems, one per scenario or a single one where all share it."""
+        if not self.lanes:
+            return [Constants(self.structure, self.size, jax.tree.map(np.asarray, qps.shared))]
+        local = Lanes(*(jax.tree.map(np.asarray, part) for part in (qps.each, qps.shared)))
+        return [Constants(s, self.size, local.lane(k)) for k, s in enumerate(self.structures)]
+
+    def core(self, qps: Lanes[CondensedQp], constants: Sequence[Constants]) -> Lanes[Core]:
+        """Everything that compiled programs know, shared where it is given once."""
+        tables = lanes_of([c.tables(self.integers) for c in constants]) if self.integers else _no_tables(qps)
+        tunings, coefficients = self.tunings, self._coefficients()
+        parts = [
+            self.layouts(),
+            lanes_of(tunings if self.own.tuning else tunings[:1]),
+            lanes_of(coefficients if self.own.model else coefficients[:1]),
+            qps,
+            tables,
+        ]
+        of = lambda key: [getattr(part, key) for part in parts]  # noqa: E731
+        statics = dict(size=self.size, switching=self.switching)
+        return Lanes(Core(*of("each"), **statics), Core(*of("shared"), **statics))
+
+    def part(self, index: np.ndarray) -> Scenarios:
+        """Some of the scenarios, in arrays of the same size."""
+        return self._like(
+            [[values[i] for i in index] for values in (self.structures, self.tunings, self.models)]
+        )
+
+    def with_tunings(self, tunings: list[Tuning]) -> Scenarios:
+        """The same scenarios with other tunings, in programs of the same form."""
+        some = self._like([self.structures, tunings, self.models])
+        some.own = self.own._replace(tuning=self.lanes)
+        return some
+
+    def _like(self, parts: list[list]) -> Scenarios:
+        some = object.__new__(Scenarios)
+        some.structures, some.tunings, some.models = parts
+        some.count, some.own = len(parts[0]), self.own
+        some.size, some.integers = self.size, self.integers
+        some.has_limits, some.switching = self.has_limits, self.switching
+        return some
+
+
+def _no_tables(qps: Lanes[CondensedQp]) -> Lanes[Tables]:
+    """For problems without integer moves; traced where these are."""
+    shared = qps.each.curvature is None
+    curvature = qps.shared.curvature if shared else qps.each.curvature
+    scale = jnp.maximum(jnp.max(jnp.diagonal(curvature, axis1=-2, axis2=-1), axis=-1), 1e-12)
+    one, square, levels = np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))
+    whole, flag = one.astype(int), one.astype(bool)
+    zero, yes = np.asarray(0), np.asarray(True)
+    rest = whole, whole, whole, flag, square, square, one, square, square, levels, one
+    fields: list[Any] = [zero, yes, *rest, scale]
+    none = Tables(*fields)
+    nothing = jax.tree.map(lambda _: None, none)
+    put = lambda tables: eqx.tree_at(lambda t: t.scale, tables, scale, is_leaf=lambda v: v is None)  # noqa: E731
+    if shared:
+        return Lanes(nothing, none)
+    return Lanes(put(nothing), eqx.tree_at(lambda t: t.scale, none, None))
+
+
+def _limited(tuning: Tuning) -> bool:
+    """Whether any CV limit costs anything; true where that is not known yet."""
+    low, high, price = tuning.cv_low, tuning.cv_high, tuning.slack_weight
+    if any(isinstance(v, Tracer) for v in (low, high, price)):
+        return True
+    return bool(((np.isfinite(low) | np.isfinite(high)) & (np.asarray(price) > 0)).any())

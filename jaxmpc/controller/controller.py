@@ -1,0 +1,420 @@
+"""Controllers (thesis 5.3, 6): `init` and `step(state, measurement, setpoint) -> (state, info)`.
+
+`Controllers` are lanes that advance together, of any structures, tunings and models; a `Controller` is one lane without its
+axis. A step is one compiled call; whole moves that it leaves open are finished on the host, by `integer.finish`. Without
+integer MVs a step is pure, and may be used inside `jax.jit`, `jax.vmap` and `jax.lax.scan`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import ArrayLike, Bool, Float
+
+from jaxmpc import status as codes
+from jaxmpc.controller.build import Scenarios
+from jaxmpc.controller.core import ControllerState, Core, Moment, StepInfo, without
+from jaxmpc.controller.sample import Sample, checked, checked_start
+from jaxmpc.errors import InputError
+from jaxmpc.integer.finish import finish_steps
+from jaxmpc.integer.host_search import SearchResult
+from jaxmpc.integer.relaxer import Relaxations, Relaxer
+from jaxmpc.integer.solve import FINISHES, UNINTERRUPTED
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import Tuning
+from jaxmpc.programs.clock import Clock
+from jaxmpc.programs.compilation import compiling_for
+from jaxmpc.programs.lanes import Lanes
+from jaxmpc.programs.packing import Packing, flattened, rebuilt
+from jaxmpc.relaxed.gap import check_gap, check_time_limit, relative_gap
+
+KEPT = 8  # combinations of CVs that are switched off, with what their searches need
+
+
+class Controllers:
+    """Controllers that advance together, one per scenario.
+
+    Args:
+        structure: for all, or one per scenario; with CVs and MVs of the same names.
+        tunings: one per scenario, or a single one for all.
+        models: one per scenario, or a single one for all.
+        count: number of scenarios where it does not follow.
+        gap: relative gap of a solve with whole moves.
+        time_limit: seconds of work per scenario and sample, None for none.
+        finish: path that closes the integer problems, see `jaxmpc.integer.solve`.
+
+    Raises:
+        InputError: naming what does not fit.
+    """
+
+    def __init__(
+        self,
+        structure: Structure | Sequence[Structure],
+        tunings: Tuning | Sequence[Tuning],
+        models: StepResponseModel | Sequence[StepResponseModel],
+        *,
+        count: int | None = None,
+        gap: float = 1e-6,
+        time_limit: float | None = None,
+        finish: str = "auto",
+    ):
+        if finish not in FINISHES:
+            raise InputError("finish", finish, f"one of {', '.join(FINISHES)}")
+        self.gap, self.time_limit = check_gap("gap", gap), check_time_limit("time_limit", time_limit)
+        self.finish = finish
+        some: Callable[[Any, type], Any] = lambda given, kind: [given] if isinstance(given, kind) else given  # noqa: E731
+        given = some(structure, Structure), some(tunings, Tuning), some(models, StepResponseModel)
+        self._take(Scenarios(*given, count))
+
+    def _take(self, scenarios: Scenarios) -> None:
+        self.scenarios, self.count, self.size = scenarios, scenarios.count, scenarios.size
+        self.structure = scenarios.structure
+        with compiling_for(str(self.size)):
+            qps = scenarios.problems(1)
+        constants = scenarios.constants(qps) if scenarios.integers else []
+        self.cores = scenarios.core(qps, constants)
+        self._relaxers = {1: Relaxer(qps, constants)} if scenarios.integers else {}
+        self.decided = False  # whether a step has been
+        self._without: dict[bytes, Controllers] = {}
+        self._packings: tuple[Packing, Packing] | None = None
+
+    def part(self, index: np.ndarray) -> Controllers:
+        """The controllers of some scenarios, which share what is computed already."""
+        if self.count == len(index) and (index == np.arange(self.count)).all():
+            return self
+        some = object.__new__(Controllers)
+        some.gap, some.time_limit, some.finish = self.gap, self.time_limit, self.finish
+        some.scenarios, some.count, some.size = self.scenarios.part(index), len(index), self.size
+        some.structure, some.cores = self.scenarios.structures[index[0]], self.cores.take(index)
+        some._relaxers = {envelope: relaxer.part(index) for envelope, relaxer in self._relaxers.items()}
+        some.decided, some._without, some._packings = self.decided, {}, None
+        return some
+
+    def repeated(self, count: int) -> Controllers:
+        """So many copies of a single controller, which share everything."""
+        return self.part(np.zeros(count, dtype=int))
+
+    def relaxer(self, envelope: int) -> Relaxer:
+        """Compiled relaxations for integer ranges of so many steps, made when first needed."""
+        if envelope not in self._relaxers:
+            qps = self.scenarios.problems(envelope)
+            self._relaxers[envelope] = Relaxer(qps, self.scenarios.constants(qps))
+        return self._relaxers[envelope]
+
+    @property
+    def searching(self) -> bool:
+        """Whether whole moves may be searched for in a compiled call, which nothing interrupts."""
+        unhurried = self.time_limit is None or self.time_limit >= UNINTERRUPTED
+        return self.finish == "auto" and unhurried
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but forms of trees, which are of no use outside this process."""
+        return {key: value for key, value in self.__dict__.items() if key != "flat"} | {"_packings": None}
+
+    @functools.cached_property
+    def flat(self) -> tuple[list[jax.Array], Any]:
+        """All that compiled programs know, taken apart."""
+        return flattened(self.cores)
+
+    # ---- steps
+    def init(
+        self, cv: Float[ArrayLike, "scenario cv"], mv: Float[ArrayLike, "scenario mv"]
+    ) -> ControllerState:
+        """State at steady states with measured CVs and present MVs (engineering units).
+
+        Raises:
+            InputError: for other shapes and values that are not finite.
+        """
+        cv, mv = checked_start(self.structure, cv, mv, lanes=self.count)
+        leaves, form = self.flat
+        return jax.tree.map(np.asarray, _init(leaves, cv, mv, form))
+
+    def step(
+        self,
+        state: ControllerState,
+        cv: Float[ArrayLike, "scenario cv"],
+        setpoint: Float[ArrayLike, "scenario cv"] | Float[ArrayLike, "scenario horizon cv"],
+        mv: Float[ArrayLike, "scenario mv"] | None = None,
+        manual: Bool[ArrayLike, "scenario mv"] | None = None,
+    ) -> tuple[ControllerState, StepInfo]:
+        """One sample of all scenarios; arguments as in `Controller.step`, the scenario axis first."""
+        return self.decide(state, checked(self.structure, cv, setpoint, mv, manual, lanes=self.count))
+
+    def decide(self, state: ControllerState, sample: Sample) -> tuple[ControllerState, StepInfo]:
+        """`step` of a checked sample."""
+        clock = Clock()
+        sample = sample._replace(setpoint=self.over_horizon(sample.setpoint))
+        settings = np.tile([self.gap, float(self.searching)], (self.count, 1))
+        given = jax.tree.map(np.asarray, (state, sample, settings))
+        leaves, form = self.flat
+        with compiling_for(str(self.size)):
+            packings = self._packing(given)
+            packed = np.asarray(_step(leaves, packings[0].pack(given), form, packings[0]))
+        state, info, moment = packings[1].unpack(packed)
+        seconds = np.full(self.count, clock.seconds / self.count)
+        left = ~moment.decision.closed & self.integer
+        if left.any():
+            state, info, seconds = self._finished(moment, info, left, seconds)
+        self.decided = True
+        return state, eqx.tree_at(lambda i: i.solve_time, info, seconds)
+
+    @functools.cached_property
+    def integer(self) -> Bool[np.ndarray, " scenario"]:
+        """Which controllers have integer MVs."""
+        return np.array([bool(s.integer_mvs) for s in self.scenarios.structures])
+
+    def over_horizon(self, setpoint: np.ndarray) -> np.ndarray:
+        """Setpoints over the shift register, the last one repeated: ``"scenario future cv"``."""
+        setpoint = np.asarray(setpoint)
+        if setpoint.ndim == 2:
+            setpoint = setpoint[:, None]
+        more = self.size.future - setpoint.shape[1]
+        if more < 0:
+            return setpoint[:, : self.size.future]
+        return np.concatenate([setpoint, np.repeat(setpoint[:, -1:], more, axis=1)], axis=1)
+
+    def _packing(self, given: Any) -> tuple[Packing, Packing]:
+        """Of what goes into a step and what comes out."""
+        if self._packings is None:
+            out = jax.eval_shape(_stepped, self.cores, *given)
+            self._packings = Packing.of(given), Packing.of(out)
+        return self._packings
+
+    def _finished(self, moment: Moment, info: StepInfo, left: np.ndarray, seconds: np.ndarray) -> tuple:
+        """State, info and times with the scenarios that the compiled program left open decided on the host."""
+        which = np.flatnonzero(left)
+        results = self.finish_open(moment, which, seconds[which])
+        found = moment.decision
+        x, good = found.x.copy(), found.closed & np.isfinite(found.x).all(axis=1)
+        fields = {
+            name: np.array(getattr(info, name))
+            for name in ("status", "objective", "bound", "gap", "nodes", "finished_by")
+        }
+        seconds = seconds.copy()
+        for i, result in zip(which, results, strict=True):
+            good[i] = result.x is not None
+            if result.x is not None:
+                x[i] = result.x
+            value, bound = (result.value, result.bound) if good[i] else (np.nan, np.nan)
+            fields["objective"][i], fields["bound"][i], fields["nodes"][i] = value, bound, result.nodes
+            fields["gap"][i] = relative_gap(value, bound, moment.unit[i])
+            fields["status"][i] = result.status
+            fields["finished_by"][i] = codes.finisher_code(result.finished_by) if good[i] else 0
+            seconds[i] = result.seconds
+        leaves, form = self.flat
+        state, moves = jax.tree.map(np.asarray, _carry_out(leaves, moment, x, good, form))
+        changed = dict(fields, move=moves[:, 0], mv=state.mv, moves=moves, fallback=~good)
+        return state, dataclasses.replace(info, **changed), seconds
+
+    def finish_open(self, moment: Moment, which: np.ndarray, spent: np.ndarray) -> list[SearchResult]:
+        """Results of scenarios that are decided on the host.
+
+        Args:
+            moment: of all scenarios, with NumPy's arrays.
+            which: scenarios to decide.
+            spent: seconds they have taken already.
+        """
+        results: dict[int, SearchResult] = {}
+        structures = [self.scenarios.structures[i] for i in which]
+        for structure in dict.fromkeys(structures):
+            index = np.array([i for i, its in zip(which, structures, strict=True) if its == structure])
+            time = float(spent[np.isin(which, index)].mean())
+            results |= zip(index, self._finish_some(moment, index, time), strict=True)
+        return [results[i] for i in which]
+
+    def _finish_some(self, moment: Moment, index: np.ndarray, spent: float) -> list[SearchResult]:
+        """Of scenarios of one structure."""
+        own: Moment = jax.tree.map(lambda leaf: np.asarray(leaf)[index], moment)
+        off = np.asarray(moment.state.sensors.off)
+        controllers = self._reduced(off) if off[index].any() else self
+        try:
+            with compiling_for(str(self.size)):
+                results, _ = finish_steps(
+                    lambda envelope: controllers.relaxer(envelope).part(index),
+                    own.instance,
+                    Relaxations.of(own.decision.root),
+                    previous_moves=own.state.plan,  # pyright: ignore[reportArgumentType]
+                    gap=self.gap,
+                    time_limit=self.time_limit,
+                    finish=self.finish,
+                    spent=spent,
+                )
+        except InputError:  # moves without limits have ranges that follow from the measurements
+            if not self.decided:
+                raise
+            return [SearchResult(None, np.inf, -np.inf, codes.FAILED, None, 0, seconds=spent)] * len(index)
+        return results
+
+    def _reduced(self, off: Bool[np.ndarray, "scenario cv"]) -> Controllers:
+        """These controllers without the CVs that are switched off."""
+        pattern = off.tobytes()
+        if pattern not in self._without:
+            scenarios = self.scenarios
+            made = {
+                (id(t), own.tobytes()): without(t, own) for t, own in zip(scenarios.tunings, off, strict=True)
+            }
+            tunings = [made[id(t), own.tobytes()] for t, own in zip(scenarios.tunings, off, strict=True)]
+            reduced = object.__new__(Controllers)
+            reduced.gap, reduced.time_limit, reduced.finish = self.gap, self.time_limit, self.finish
+            reduced._take(scenarios.with_tunings(tunings))
+            self._without[pattern] = reduced
+            while len(self._without) > KEPT:
+                self._without.pop(next(iter(self._without)))
+        return self._without[pattern]
+
+
+@functools.partial(jax.jit, static_argnames="form")
+def _init(leaves, cv, mv, form) -> ControllerState:
+    cores: Lanes[Core] = rebuilt(form, leaves)
+    one = lambda own, cv, mv: eqx.combine(own, cores.shared).init(cv, mv)  # noqa: E731
+    return jax.vmap(one)(cores.each, cv, mv)
+
+
+@jax.jit
+def considered(cores: Lanes[Core], state: ControllerState, sample: Sample, settings) -> Moment:
+    """A sample of all scenarios, decided as far as a compiled program decides it.
+
+    Args:
+        cores: of the controllers.
+        state: before the sample.
+        sample: what is known.
+        settings: ``"scenario 2"``, relative gap, and whether whole moves may be searched for (1 or 0).
+    """
+
+    def one(own, state, sample, settings):
+        core: Core = eqx.combine(own, cores.shared)
+        return core.consider(state, sample, settings[0], settings[1] > 0)
+
+    return jax.vmap(one)(cores.each, state, sample, settings)
+
+
+@jax.jit
+def _stepped(cores: Lanes[Core], state, sample, settings) -> tuple:
+    moments = considered(cores, state, sample, settings)
+    return *jax.vmap(lambda own, moment: eqx.combine(own, cores.shared).conclude(moment))(
+        cores.each, moments
+    ), moments
+
+
+@functools.partial(jax.jit, static_argnames=("form", "packing"))
+def _step(leaves, packed, form, packing: Packing):
+    """State, info and moment of all scenarios; goes in and comes out packed."""
+    out = _stepped(rebuilt(form, leaves), *packing.unpack(packed))
+    return Packing.of(out).pack(out)
+
+
+@functools.partial(jax.jit, static_argnames="form")
+def _carry_out(leaves, moment: Moment, x, good, form):
+    cores: Lanes[Core] = rebuilt(form, leaves)
+    one = lambda own, *rest: eqx.combine(own, cores.shared).carry_out(*rest)  # noqa: E731
+    return jax.vmap(one)(cores.each, moment, x, good)
+
+
+class Controller:
+    """MPC of one process (thesis chapters 5 and 6), with whole moves of the integer MVs if the structure has any.
+
+    Without integer MVs, `init` and `step` are pure functions inside `jax.jit`, `jax.vmap` and `jax.lax.scan`, and the tuning
+    may be traced as well.
+
+    Args:
+        structure: static configuration.
+        tuning: weights and limits.
+        model: step-response model.
+        gap: relative gap of a solve with whole moves.
+        time_limit: seconds per solve, None for none.
+        finish: path that closes the integer problem, see `jaxmpc.integer.solve`.
+    """
+
+    def __init__(
+        self,
+        structure: Structure,
+        tuning: Tuning,
+        model: StepResponseModel,
+        *,
+        gap: float = 1e-6,
+        time_limit: float | None = None,
+        finish: str = "auto",
+    ):
+        self.lanes = Controllers(structure, tuning, model, gap=gap, time_limit=time_limit, finish=finish)
+        self.structure, self.tuning, self.model = structure, tuning, model
+        self.gap, self.time_limit, self.finish = gap, time_limit, finish
+
+    @property
+    def compiled(self) -> bool:
+        """Whether its steps may be part of a compiled loop."""
+        return True
+
+    @property
+    def core(self) -> Core:
+        """What compiled programs know of the controller."""
+        return self.lanes.cores.shared
+
+    def init(self, cv: Float[ArrayLike, " cv"], mv: Float[ArrayLike, " mv"]) -> ControllerState:
+        """State at a steady state with measured CVs and present MVs (engineering units).
+
+        Raises:
+            InputError: for other shapes and values that are not finite.
+        """
+        cv, mv = checked_start(self.structure, cv, mv)
+        if _traced(self.core, cv, mv):
+            return self.core.init(jnp.asarray(cv), jnp.asarray(mv))
+        return one_lane(self.lanes.init(np.asarray(cv)[None], np.asarray(mv)[None]))
+
+    def step(
+        self,
+        state: ControllerState,
+        cv: Float[ArrayLike, " cv"],
+        setpoint: Float[ArrayLike, " cv"] | Float[ArrayLike, "horizon cv"],
+        mv: Float[ArrayLike, " mv"] | None = None,
+        manual: Bool[ArrayLike, " mv"] | None = None,
+    ) -> tuple[ControllerState, StepInfo]:
+        """One sample.
+
+        Args:
+            state: from `init` or the previous step.
+            cv: measurement now [CV unit]; NaN where there is none.
+            setpoint: at j = 1..Hp, or held over the horizon [CV unit].
+            mv: where the actuators stand before the move [MV unit], NaN where that is not known; without it, demands
+                count as followed.
+            manual: MVs that somebody else moves; they are predicted from `mv` and not moved.
+
+        Returns:
+            The state after the sample, and what was done.
+
+        Raises:
+            InputError: for other shapes, setpoints that are not finite, and where double precision is off.
+            TypeError: for traced values where there are integer MVs, whose search may go on outside the program.
+        """
+        sample = checked(self.structure, cv, setpoint, mv, manual)
+        if not _traced(self.core, state, sample):
+            lane, of_lane = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (state, sample))
+            return self._shown(*one_lane(self.lanes.decide(lane, of_lane)))
+        if self.structure.integer_mvs:
+            raise TypeError("step() of a controller with integer MVs runs on the host and cannot be traced")
+        given = jnp.asarray(sample.setpoint)
+        rows = given[None] if given.ndim == 1 else given
+        more = jnp.repeat(rows[-1:], max(self.core.size.future - rows.shape[0], 0), axis=0)
+        sample = sample._replace(setpoint=jnp.concatenate([rows, more])[: self.core.size.future])
+        return self._shown(*self.core.conclude(self.core.consider(state, sample, self.gap)))
+
+    def _shown(self, state: ControllerState, info: StepInfo) -> tuple[ControllerState, StepInfo]:
+        """The planned moves without padding."""
+        return state, eqx.tree_at(lambda i: i.moves, info, info.moves[: self.structure.block_count])
+
+
+def _traced(*trees: Any) -> bool:
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def one_lane(tree: Any) -> Any:
+    """The only lane, on the host: indexing a JAX array is a dispatch."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[0], tree)

@@ -1,0 +1,407 @@
+"""What compiled programs know of a controller (thesis 5.3, 6), and the steps of a sample that they take with it.
+
+`Core` has no structure, only its arrays: controllers of one size share programs, and may be lanes of one batch. A sample is
+observed (2.31), posed as a problem (5.8), decided (`integer.search`) and carried out. A bad measurement is left out, a
+solve that gives no plan holds the MVs, and the info says so.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxmpc import status as codes
+from jaxmpc.controller.bias import filter_bias
+from jaxmpc.controller.measurement import GOOD, Sensors
+from jaxmpc.controller.sample import Sample
+from jaxmpc.integer.search import Decision, decide
+from jaxmpc.integer.tables import Tables
+from jaxmpc.model.step_response import advance_free_response, shift_free_response
+from jaxmpc.problem.condense import CondensedQp, condense, matrices_of
+from jaxmpc.problem.instance import QpInstance, make_instance
+from jaxmpc.problem.layout import Layout, Size
+from jaxmpc.problem.tuning import Tuning
+from jaxmpc.relaxed.gap import relative_gap
+from jaxmpc.relaxed.newton import WarmStart
+from jaxmpc.relaxed.solve import cold_start, shifted_start
+
+
+class ControllerState(eqx.Module):
+    """What a controller remembers from sample to sample.
+
+    Attributes:
+        base: CVs the run started from; predictions are deviations from them [CV unit].
+        future: effect of the moves made so far on the samples from now on [CV unit].
+        bias: filtered output bias v(k|k).
+        bias_raw: output bias before the filter (2.31b).
+        mv: present demand [MV unit].
+        position: where the actuators stand in the predictions [MV unit].
+        last_move: previous move, of the actuators where these are told [MV unit].
+        past_moves: the last moves, oldest first [MV unit].
+        plan: the previous plan shifted by one sample, block moves [MV unit].
+        warm: moves and prices of the previous relaxation, shifted; where the next solve starts.
+        sensors: what the measurements were worth.
+        manual: MVs that somebody else moved at the last sample.
+    """
+
+    base: Float[Array, " cv"]
+    future: Float[Array, "cv future"]
+    bias: Float[Array, " cv"]
+    bias_raw: Float[Array, " cv"]
+    mv: Float[Array, " mv"]
+    position: Float[Array, " mv"]
+    last_move: Float[Array, " mv"]
+    past_moves: Float[Array, "past mv"]
+    plan: Float[Array, "block mv"]
+    warm: WarmStart
+    sensors: Sensors
+    manual: Bool[Array, " mv"]
+
+
+class StepInfo(eqx.Module):
+    """What one controller step did.
+
+    Attributes:
+        move: applied move [MV unit].
+        mv: demand after it [MV unit].
+        moves: planned block moves [MV unit].
+        status: code of `jaxmpc.status`.
+        fallback: the MVs were held because there was no plan.
+        recovering: an MV was outside its limits and is being brought back.
+        quality: of the measurements, codes of `jaxmpc.controller.measurement.QUALITY`: 0 good, all others were left out.
+        off: CVs that are switched off, because too many measurements in a row were left out.
+        objective, bound, gap: value of the plan (6.6), proven bound, relative gap; not a number without a plan.
+        nodes: relaxations solved (iterations of the one relaxation for continuous moves).
+        finished_by: code of `jaxmpc.status.FINISHERS`.
+        solve_time: wall time of the solve [s]; not a number inside a compiled loop, which has no clock.
+    """
+
+    move: Float[Array, " mv"]
+    mv: Float[Array, " mv"]
+    moves: Float[Array, "block mv"]
+    status: Int[Array, ""]
+    fallback: Bool[Array, ""]
+    recovering: Bool[Array, ""]
+    quality: Int[Array, " cv"]
+    off: Bool[Array, " cv"]
+    objective: Float[Array, ""]
+    bound: Float[Array, ""]
+    gap: Float[Array, ""]
+    nodes: Int[Array, ""]
+    finished_by: Int[Array, ""]
+    solve_time: Float[Array, ""]
+
+
+class Moment(NamedTuple):
+    """A sample that is observed and decided as far as a compiled program decides it.
+
+    Attributes:
+        state: after the measurement.
+        free_response: Lambda (5.13) at j = 1, 2, ... [CV unit].
+        instance: its problem.
+        decision: what the search found.
+        scale: MV units per unit of x.
+        unit: of the objective, see `gap.closes`.
+        recovering: whether an MV is outside its limits.
+    """
+
+    state: ControllerState
+    free_response: Float[Array, "future cv"]
+    instance: QpInstance
+    decision: Decision
+    scale: Float[Array, " n"]
+    unit: Float[Array, ""]
+    recovering: Bool[Array, ""]
+
+
+class Core(eqx.Module):
+    """Everything of a controller that stays the same from sample to sample, as arrays of a size.
+
+    Attributes:
+        layout: the structure.
+        tuning: weights and limits.
+        coefficients: of the model, as long as the shift register [CV unit per MV unit].
+        qp: constant part of the problems.
+        tables: what the search for whole moves reads.
+        size: of the arrays.
+        switching: whether a CV may be switched off by bad measurements.
+    """
+
+    layout: Layout
+    tuning: Tuning
+    coefficients: Float[Array, "cv mv future"]
+    qp: CondensedQp
+    tables: Tables
+    size: Size = eqx.field(static=True)
+    switching: bool = eqx.field(static=True)
+
+    def init(self, cv: Float[Array, " cv"], mv: Float[Array, " mv"]) -> ControllerState:
+        """State of a controller that starts in a steady state.
+
+        Args:
+            cv: measured CVs [CV unit].
+            mv: present MVs [MV unit].
+        """
+        s, zeros = self.size, lambda *shape: jnp.zeros(shape)
+        cv, mv = jnp.asarray(cv, dtype=jnp.float64), jnp.asarray(mv, dtype=jnp.float64)
+        state = ControllerState(
+            base=cv,
+            future=zeros(s.cvs, s.future),
+            bias=zeros(s.cvs),
+            bias_raw=zeros(s.cvs),
+            mv=mv,
+            position=mv,
+            last_move=zeros(s.mvs),
+            past_moves=zeros(s.past, s.mvs),
+            plan=zeros(s.blocks, s.mvs),
+            warm=None,  # pyright: ignore[reportArgumentType]
+            sensors=Sensors.fresh(cv),
+            manual=jnp.zeros(s.mvs, dtype=bool),
+        )
+        response = jnp.broadcast_to(cv, (s.future, s.cvs))
+        cold = cold_start(self.qp, self.instance(state, self.qp, self.tuning, response, response))
+        return eqx.tree_at(lambda s: s.warm, state, cold, is_leaf=lambda v: v is None)
+
+    def locate(self, state: ControllerState, mv, manual) -> ControllerState:
+        """Predict from where the actuators stand, as if they had moved there in place of the last move.
+
+        Args:
+            state: from `init` or `remember`.
+            mv: ``"mv"``, positions now [MV unit]; not a number where the demand counts as followed.
+            manual: ``"mv"``, MVs that somebody else moves.
+
+        Returns:
+            The state with a demand within `demand_lead` of the positions, and at them in manual.
+        """
+        tuning, known = self.tuning, jnp.isfinite(mv)
+        manual = jnp.broadcast_to(manual, state.mv.shape)
+        position = jnp.where(known, mv, state.position)
+        missed = position - state.position
+        lead = jnp.where(manual, 0.0, tuning.demand_lead)
+        demand = jnp.clip(state.mv, position - lead, position + lead)
+        # what somebody else moved must not make the oscillation rows (6.16) impossible to satisfy
+        last = jnp.clip(state.last_move + missed, tuning.move_low, tuning.move_high)
+        return eqx.tree_at(
+            lambda s: (s.future, s.mv, s.position, s.last_move, s.past_moves, s.manual),
+            state,
+            (
+                advance_free_response(state.future, self.coefficients, missed),
+                jnp.where(known, demand, state.mv),
+                position,
+                jnp.where(missed != 0.0, last, state.last_move),
+                jnp.asarray(state.past_moves).at[-1].add(missed),
+                manual,
+            ),
+        )
+
+    def observe(
+        self, state: ControllerState, cv, mv, manual
+    ) -> tuple[ControllerState, Float[Array, "future cv"]]:
+        """Compare a measurement with its prediction, update the bias, and move on to the next sample.
+
+        Args:
+            state: from `init` or `remember`; its future starts at the present sample.
+            cv: measurement now [CV unit]; a bad one leaves the bias to itself.
+            mv, manual: as in `locate`.
+
+        Returns:
+            ``(state, free_response)``: the future now starts at the next sample; Lambda (5.13) at j = 1, 2, ....
+        """
+        tuning, dt = self.tuning, jnp.asarray(self.layout.dt)
+        state = self.locate(state, mv, manual)
+        sensors = state.sensors.judged(tuning, cv)
+        good = sensors.quality == GOOD
+        kept = jnp.exp(-dt / tuning.bias_decay)
+        raw = jnp.where(good, cv - (state.base + state.future[:, 0]), kept * state.bias_raw)  # (2.31b)
+        bias = filter_bias(state.bias, state.bias_raw, raw, tuning.bias_cutoff, dt)
+        bias = jnp.where(good, bias, kept * state.bias)
+        future = shift_free_response(state.future)
+        state = eqx.tree_at(
+            lambda s: (s.bias, s.bias_raw, s.future, s.sensors), state, (bias, raw, future, sensors)
+        )
+        return state, state.base + future.T + bias
+
+    def limits_now(self, state: ControllerState) -> Tuning:
+        """The tuning of this sample: MVs in manual stay where they are, whatever their limits."""
+        held = lambda fixed, given: jnp.where(state.manual, fixed, given)  # noqa: E731
+        tuning = self.tuning
+        return eqx.tree_at(
+            lambda t: (t.move_low, t.move_high, t.mv_low, t.mv_high, t.oscillation_rows),
+            tuning,
+            (
+                held(0.0, tuning.move_low),
+                held(0.0, tuning.move_high),
+                held(-jnp.inf, tuning.mv_low),
+                held(jnp.inf, tuning.mv_high),
+                ~state.manual & tuning.oscillation_rows,
+            ),
+        )
+
+    def instance(self, state: ControllerState, qp, tuning: Tuning, free_response, setpoint) -> QpInstance:
+        """The problem after a measurement, with MVs outside their limits on their way back."""
+        return make_instance(
+            self.layout,
+            self.size,
+            tuning,
+            qp,
+            free_response=free_response,
+            setpoint=jnp.broadcast_to(setpoint, free_response.shape),
+            mv_now=state.mv,
+            last_move=state.last_move,
+            past_moves=state.past_moves,
+            recover=True,
+        )
+
+    def condensed_now(self, off: Bool[Array, " cv"]) -> tuple[CondensedQp, Tables]:
+        """The constant part of this sample's problem, another one while CVs are switched off; and its tables."""
+        if not self.switching:
+            return self.qp, self.tables
+
+        def reduced() -> CondensedQp:
+            given = self.qp
+            matrices = matrices_of(self.layout, self.size, self.coefficients, summed=False)
+            matrices = eqx.tree_at(lambda m: m.summed, matrices, given.summed, is_leaf=lambda v: v is None)
+            levels, tuning = given.steep.shape[0], without(self.tuning, off)
+            return condense(
+                self.layout, self.size, tuning, matrices, envelope=levels, has_limits=given.has_limits
+            )
+
+        qp = jax.lax.cond(jnp.any(off), reduced, lambda: self.qp)
+        known = self.tables.known & ~jnp.any(off)
+        scale = jnp.maximum(jnp.max(jnp.diagonal(qp.curvature)), 1e-12)
+        return qp, eqx.tree_at(lambda t: (t.known, t.scale), self.tables, (known, scale))
+
+    def consider(self, state: ControllerState, sample: Sample, gap, search=True) -> Moment:
+        """Observe, pose and decide a sample.
+
+        Args:
+            state: before it.
+            sample: what is known.
+            gap: relative gap at which whole moves are optimal.
+            search: whether whole moves may be searched for here; otherwise none but the relaxation is solved.
+        """
+        state, free_response = self.observe(state, sample.cv, sample.mv, sample.manual)
+        tuning = without(self.limits_now(state), state.sensors.off)
+        qp, tables = self.condensed_now(state.sensors.off)
+        instance = self.instance(state, qp, tuning, free_response, sample.setpoint)
+        tables = eqx.tree_at(lambda t: t.known, tables, tables.known & search)
+        decision = decide(qp, tables, instance, state.warm, gap)
+        recovering = outside_limits(tuning, state.mv)
+        return Moment(state, free_response, instance, decision, qp.scale, tables.scale, recovering)
+
+    def carry_out(
+        self, moment: Moment, x: Float[Array, " n"], good: Bool[Array, ""]
+    ) -> tuple[ControllerState, Float[Array, "block mv"]]:
+        """Apply the first moves of a plan; the MVs are held where there is none.
+
+        Args:
+            moment: the sample.
+            x: the plan.
+            good: whether there is one.
+
+        Returns:
+            ``(state, planned moves)``: predictions, history, and plan and prices shifted by one sample.
+        """
+        state, warm = moment.state, moment.decision.root.warm
+        planned = (x * moment.scale).reshape(self.size.mvs, -1).T
+        first = self.first_move(moment.scale, moment.instance, planned[0])
+        moves = jnp.where(good, planned.at[0].set(first), 0.0)
+        warm = jax.tree.map(lambda new, old: jnp.where(good, new, old), warm, state.warm)
+        return self.remember(state, moves, warm), moves
+
+    def remember(
+        self, state: ControllerState, moves: Float[Array, "block mv"], warm: WarmStart
+    ) -> ControllerState:
+        """The state after moves of which the first was made: predictions, history, plan and prices of the next sample.
+
+        Args:
+            state: from `observe`.
+            moves: the plan [MV unit], padded.
+            warm: of its relaxation.
+        """
+        move = moves[0]
+        return ControllerState(
+            base=state.base,
+            future=advance_free_response(state.future, self.moving(state.mv, move), move),
+            bias=state.bias,
+            bias_raw=state.bias_raw,
+            mv=state.mv + move,
+            position=state.position + move,
+            last_move=move,
+            past_moves=jnp.concatenate([state.past_moves[1:], move[None]]),
+            plan=self.layout.shift @ moves,
+            warm=shifted_start(warm, self.size.cvs),
+            sensors=state.sensors,
+            manual=state.manual,
+        )
+
+    def moving(self, before: Float[Array, " mv"], move: Float[Array, " mv"]) -> Float[Array, "cv mv future"]:
+        """Coefficients with which a move enters the shift register."""
+        return self.coefficients
+
+    def first_move(self, scale, instance: QpInstance, move: Float[Array, " mv"]) -> Float[Array, " mv"]:
+        """The move to apply [MV unit]: solver tolerance must not leave what the limits allow the first block."""
+        mv, held = np.arange(self.size.mvs), self.layout.count[0]
+        first, row = mv * self.size.blocks, mv * self.size.rows
+        low = jnp.maximum(instance.lower[first], instance.row_low[row] / held)
+        high = jnp.minimum(instance.upper[first], instance.row_high[row] / held)
+        return jnp.clip(move / scale[first], low, high) * scale[first]
+
+    def conclude(self, moment: Moment) -> tuple[ControllerState, StepInfo]:
+        """Carry out what the compiled program decided; the MVs are held where it left something open."""
+        found = moment.decision
+        good = found.closed & jnp.all(jnp.isfinite(found.x))
+        state, moves = self.carry_out(moment, found.x, good)
+        certified = lambda value: jnp.where(good, value, jnp.nan)  # noqa: E731
+        info = StepInfo(
+            move=moves[0],
+            mv=state.mv,
+            moves=moves,
+            status=jnp.where(good, codes.OPTIMAL, codes.FAILED),
+            fallback=~good,
+            recovering=moment.recovering,
+            quality=state.sensors.quality,
+            off=state.sensors.off,
+            objective=certified(found.value),
+            bound=certified(found.bound),
+            gap=certified(relative_gap(found.value, found.bound, moment.unit)),
+            nodes=jnp.where(self.tables.count == 0, found.steps, found.nodes),
+            finished_by=jnp.where(good, found.finished_by, 0),
+            solve_time=jnp.asarray(jnp.nan),
+        )
+        return state, info
+
+
+def outside_limits(tuning: Tuning, mv: Float[Array, " mv"]) -> Bool[Array, ""]:
+    """Whether any MV is outside its limits by more than rounding."""
+    drift = 1e-6 * jnp.maximum(1.0, jnp.abs(mv))
+    return jnp.any((mv < tuning.mv_low - drift) | (mv > tuning.mv_high + drift))
+
+
+def without(tuning: Tuning, off: Bool[Array, " cv"]) -> Tuning:
+    """The tuning without weights and limits of the CVs that are switched off; on the host if these are."""
+    xp: Any = np if isinstance(off, np.ndarray) else jnp
+    none = lambda values: xp.where(off, 0.0, values)  # noqa: E731
+    return eqx.tree_at(
+        lambda t: (t.cv_weight, t.soft_quadratic, t.soft_linear, t.slack_weight, t.cv_low, t.cv_high),
+        tuning,
+        (
+            none(tuning.cv_weight),
+            none(tuning.soft_quadratic),
+            none(tuning.soft_linear),
+            none(tuning.slack_weight),
+            xp.where(off, -np.inf, tuning.cv_low),
+            xp.where(off, np.inf, tuning.cv_high),
+        ),
+    )
+
+
+def may_switch(tuning: Tuning) -> bool:
+    """Whether a CV can be switched off; true where that is not known yet."""
+    return isinstance(tuning.bad_limit, Tracer) or bool(np.isfinite(tuning.bad_limit).any())

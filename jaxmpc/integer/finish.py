@@ -1,0 +1,126 @@
+"""Whole moves of steps that the compiled search left open: envelope, finite limits, search on the host.
+
+Between `integer.solve`, which knows scaled problems only, and its callers, which know engineering units.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxmpc.errors import InputError
+from jaxmpc.integer.feasible import UndecidedError, chains_of, nearest, whole
+from jaxmpc.integer.host_search import SearchResult
+from jaxmpc.integer.relaxer import Relaxations, Relaxer
+from jaxmpc.integer.solve import solve_integers
+from jaxmpc.integer.tables import Constants
+from jaxmpc.problem.instance import QpInstance
+from jaxmpc.problem.memory import check_ranges
+from jaxmpc.programs.clock import Clock
+
+WIDEST_ENVELOPE = 4  # steps up to which the envelope of the squared integer move is built
+
+
+def finish_steps(
+    relaxer_of: Callable[[int], Relaxer],
+    instances: QpInstance,
+    root: Relaxations,
+    *,
+    previous_moves: Float[np.ndarray, "scenario block mv"],
+    gap: float,
+    time_limit: float | None,
+    finish: str,
+    spent: float = 0.0,
+) -> tuple[list[SearchResult], Relaxations]:
+    """Solve one step of every scenario; all have the same integer moves.
+
+    Args:
+        relaxer_of: compiled relaxations for integer ranges of so many steps.
+        instances: the problems, first axis ``"scenario"``, NumPy's arrays.
+        root: their relaxations for moves of one step.
+        previous_moves: start [MV unit].
+        gap: relative gap.
+        time_limit: seconds of work per scenario, None for none.
+        finish: one of `integer.solve.FINISHES`.
+        spent: seconds that every scenario has taken already.
+
+    Returns:
+        How the steps ended, and their relaxations.
+
+    Raises:
+        InputError: for ranges of whole moves that cannot be searched.
+    """
+    clock, relaxer = Clock(), relaxer_of(1)
+    lower, upper = _bounded(relaxer_of, instances)
+    constants = relaxer.scenario(0)
+    integer = constants.integer
+    check_ranges(constants.structure, lower[:, integer], upper[:, integer])
+    widest = int(max(np.abs(lower[:, integer]).max(), np.abs(upper[:, integer]).max()))
+    if widest > 1:
+        relaxer = relaxer_of(widest if widest <= WIDEST_ENVELOPE else 0)
+        instances = eqx.tree_at(lambda i: (i.lower, i.upper), instances, (lower, upper))
+        root = relaxer.solve_roots(instances, relaxer.cold(instances))
+    starts = []
+    for i, moves in enumerate(previous_moves):
+        own = relaxer.scenario(i)
+        wanted = moves.T.reshape(-1)[own.integer] / own.scales[own.integer]
+        starts.append([np.clip(np.nan_to_num(wanted), -1e6, 1e6)])
+    results = solve_integers(
+        relaxer,
+        instances,
+        root,
+        starts=starts,
+        gap=gap,
+        time_limit=time_limit,
+        finish=finish,
+        spent=spent + clock.seconds / len(starts),
+    )
+    return results, root
+
+
+def _bounded(relaxer_of, instances: QpInstance) -> tuple[np.ndarray, np.ndarray]:
+    """Limits ``"scenario n"``, finite for integer moves that have none: the level set of a rounded plan."""
+    lower, upper = np.array(instances.lower), np.array(instances.upper)
+    integer = relaxer_of(1).scenario(0).integer
+    if np.isfinite(lower[:, integer]).all() and np.isfinite(upper[:, integer]).all():
+        return lower, upper
+    relaxer = relaxer_of(0)
+    start = relaxer.cold(instances)
+    root = relaxer.solve_roots(instances, start)
+    center = root.x[:, integer]
+    fixed_low, fixed_high = lower.copy(), upper.copy()
+    for i in range(len(lower)):
+        own = jax.tree.map(lambda leaf, i=i: leaf[i], instances)
+        wanted = np.clip(center[i], lower[i, integer], upper[i, integer])
+        fixed_low[i, integer] = fixed_high[i, integer] = _whole_near(relaxer.scenario(i), own, wanted)
+    fixed = eqx.tree_at(lambda i: (i.lower, i.upper), instances, (fixed_low, fixed_high))
+    value = relaxer.solve_roots(fixed, start).snapped
+    radius = np.stack([relaxer.scenario(i).radius for i in range(len(lower))])
+    reach = np.sqrt(2.0 * np.maximum(value - root.bound, 0.0)[:, None] * radius) + 1.0
+    if not np.isfinite(reach).all():
+        raise InputError(
+            "tuning.move_low",
+            "infinite",
+            "finite move or MV limits for an integer MV that has neither weight nor effect, or that no whole moves"
+            " near the relaxed ones satisfy",
+        )
+    lower[:, integer] = np.maximum(lower[:, integer], np.ceil(center - reach))
+    upper[:, integer] = np.minimum(upper[:, integer], np.floor(center + reach))
+    return lower, upper
+
+
+def _whole_near(constants: Constants, instance: QpInstance, wanted: np.ndarray) -> np.ndarray:
+    """Whole moves near `wanted` that satisfy the hard rows; the rounded ones where there are none within reach."""
+    chains = chains_of(constants.structure, constants.size, instance.row_low, instance.row_high)  # pyright: ignore
+    for reach in (0, 3, 30):
+        low, high = whole(np.floor(wanted + 0.5)) - reach, whole(np.floor(wanted + 0.5)) + reach
+        with contextlib.suppress(UndecidedError):
+            found = nearest(chains, wanted, low, high)
+            if found is not None:
+                return found
+    return np.round(wanted)

@@ -1,0 +1,138 @@
+"""What the search for whole moves needs of a problem's constant part, computed once per structure, model and tuning.
+
+The host reads `Constants`, the compiled search the arrays of `Tables`, padded to a rung of `INTEGERS`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxmpc.errors import InputError
+from jaxmpc.integer.lower_bound import assignment_order, leading_factor, root_factor, schur_complement
+from jaxmpc.problem.blocking import moves_per_block, oscillation_rows
+from jaxmpc.problem.condense import CondensedQp
+from jaxmpc.problem.layout import Size
+from jaxmpc.problem.structure import Structure
+
+INTEGERS = (8, 16, 31)  # rungs; codes of 64 bits hold so many moves of two bits
+
+
+class Tables(eqx.Module):
+    """Constants of a scenario that the search reads, integer moves in the order in which they are assigned.
+
+    Attributes:
+        count: integer moves; what follows them is padding.
+        known: whether the search knows all hard rows and its codes hold all moves.
+        column: their places in x; out of range for padding.
+        position: hard row of the position after a move.
+        pair: hard row that couples it to the move before.
+        coupled: whether there is one.
+        reach: row i gives the position of its MV after move i.
+        previous: row i picks the move before i of the same MV.
+        radius, leading: as in `lower_bound.LowerModel`.
+        root: factor of the curvature, `lower_bound.root_factor`.
+        slope: of the envelope of every move.
+        own_weight: see `cuts`.
+        scale: see `gap.closes`.
+    """
+
+    count: Int[Array, ""]
+    known: Bool[Array, ""]
+    column: Int[Array, " integer"]
+    position: Int[Array, " integer"]
+    pair: Int[Array, " integer"]
+    coupled: Bool[Array, " integer"]
+    reach: Float[Array, "integer integer"]
+    previous: Float[Array, "integer integer"]
+    radius: Float[Array, " integer"]
+    leading: Float[Array, "integer integer"]
+    root: Float[Array, "integer integer"]
+    slope: Float[Array, "level integer"]
+    own_weight: Float[Array, " integer"]
+    scale: Float[Array, ""]
+
+
+class Constants:
+    """Of one scenario.
+
+    Args:
+        structure: of the controller.
+        size: of its arrays.
+        qp: constant part of its problems, with NumPy's arrays.
+
+    Raises:
+        InputError: for weights and responses whose products are not finite.
+    """
+
+    def __init__(self, structure: Structure, size: Size, qp: CondensedQp):
+        self.structure, self.size, self.qp = structure, size, qp
+        blocks = np.arange(structure.block_count)
+        columns = [mv * size.blocks + blocks for mv in structure.integer_mvs]
+        self.integer = np.concatenate([*columns, []]).astype(int)  # places of the integer moves in x
+        self.scales = np.asarray(qp.scale)  # MV units per unit of x
+        hessian, curvature = np.asarray(qp.hessian), np.asarray(qp.curvature)
+        self.order = assignment_order(structure.block_count, len(structure.integer_mvs))
+        try:
+            with np.errstate(over="raise", invalid="raise"):
+                _check_finite(qp)
+                self.schur, self.radius = schur_complement(hessian, self.integer)
+                self.root_factor = root_factor(self.schur)
+                self.leading = leading_factor(self.schur[np.ix_(self.order, self.order)])
+        except (FloatingPointError, np.linalg.LinAlgError):
+            raise InputError(
+                "tuning",
+                "weights and step responses of very different sizes",
+                "numbers whose products are finite [CV unit, MV unit]",
+                "Check cv_weight, move_weight, soft_quadratic, the model's coefficients and the integer steps",
+            ) from None
+        self.slope = np.asarray(qp.steep)[:, self.integer]  # of the envelope
+        self.knot = np.arange(len(self.slope), dtype=float)[:, None]
+        self.scale = max(float(np.diag(curvature).max()), 1e-12)
+        self.own_weight = 0.5 * (np.diag(curvature) - np.diag(hessian))[self.integer]
+
+    def tables(self, integers: int) -> Tables:
+        """For the compiled search, with room for so many integer moves."""
+        structure, size, order = self.structure, self.size, self.order
+        count, blocks, room = len(order), structure.block_count, integers - len(order)
+        known = room >= 0 and structure.mean_move_mode != "predictive"
+        if not known:
+            order, count, room = order[:integers], min(count, integers), max(room, 0)
+        mv, block = np.asarray(structure.integer_mvs, dtype=int)[order // blocks], order % blocks
+        mine, counts = mv[:, None] == mv[None, :], moves_per_block(structure)
+        coupled = np.zeros(blocks, dtype=bool)
+        pairs = oscillation_rows(structure)
+        coupled[np.argmax(pairs, axis=1) if len(pairs) else []] = True
+        place = mv * size.rows + block
+
+        def padded(values, absent: float = 0):
+            widths = [(0, room if n == count else 0) for n in values.shape]
+            return np.pad(values, widths, constant_values=absent)
+
+        one = lambda values: values[order]  # noqa: E731
+        fields: dict[str, Any] = dict(
+            count=np.asarray(count),
+            known=np.asarray(known),
+            column=padded(one(self.integer), size.moves),
+            position=padded(place),
+            pair=padded(size.blocks + place),
+            coupled=padded(coupled[block]),
+            reach=padded((mine & (block[None, :] <= block[:, None])) * counts[block][None, :].astype(float)),
+            previous=padded((mine & (block[None, :] == block[:, None] - 1)).astype(float)),
+            radius=padded(one(self.radius), np.inf),
+            leading=padded(self.leading[:count, :count]),
+            root=padded(one(self.root_factor)[:, :count]),
+            slope=np.pad(self.slope[:, order], ((0, 0), (0, room))),
+            own_weight=padded(one(self.own_weight)),
+            scale=np.asarray(self.scale),
+        )
+        return Tables(**fields)
+
+
+def _check_finite(qp: CondensedQp) -> None:
+    for values in (qp.hessian, qp.curvature, qp.scale, qp.row_size, qp.bend, qp.reach):
+        if not np.isfinite(values).all():
+            raise FloatingPointError

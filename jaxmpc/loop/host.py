@@ -1,0 +1,112 @@
+"""A closed loop that asks the host at every sample: for plants outside JAX, controllers that take over, plans carried out.
+
+`loop.simulate` is the only caller.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from jaxmpc.controller.controller import Controller
+from jaxmpc.controller.core import ControllerState, StepInfo
+from jaxmpc.controller.measurement import received
+from jaxmpc.controller.sample import Sample
+from jaxmpc.loop.compiled import Inputs
+from jaxmpc.loop.interventions import CarriedOut, handed_over
+
+REPORT = 20  # samples between two progress reports
+
+
+def simulate_on_host(
+    plant: Any,
+    inputs: Inputs,
+    takeovers: dict[int, Controller],
+    blind: int | None,
+    progress: Callable[[int, int], None] | None,
+) -> dict[str, np.ndarray]:
+    """One closed loop; fields of `Trajectory`.
+
+    Args:
+        plant: with `init()` and `step(mv, disturbance)`.
+        inputs: of one scenario.
+        takeovers: controllers by the first sample that they decide.
+        blind: sample whose plan is carried out without feedback; None for none.
+        progress: called with ``(done, total)`` samples.
+    """
+    setpoints, offsets, errors, faults = (v[0] for v in inputs[:4])
+    told, total = bool(inputs.told[0]), len(setpoints)
+    outputs = plant.init()
+    now, mv = np.asarray(outputs.cv), np.asarray(outputs.mv)
+    states: dict[int, ControllerState] = {}
+    for k, one in takeovers.items():
+        states[k] = one.lanes.init(now[None], mv[None])
+        one.lanes.decide(
+            states[k], _sample(now, now, np.full_like(mv, np.nan))
+        )  # compile before the clock starts
+    controller, state = takeovers[0], states[0]
+    records: list[dict[str, Any]] = []
+    carried = None
+    with _undisturbed():
+        for k in range(total):
+            cv = np.asarray(outputs.cv) + errors[k]
+            if k in takeovers:
+                controller, state = takeovers[k], handed_over(state, states[k])
+            if carried is None or blind is None:
+                arrived = received(cv, faults[k], np.asarray(state.sensors.value)[0])
+                stands = np.asarray(outputs.mv)
+                sample = _sample(arrived, setpoints[k], stands if told else np.full_like(stands, np.nan))
+                state, info = controller.lanes.decide(state, sample)
+                record = _record(cv, state, info)
+                carried = CarriedOut(controller.structure, record) if k == blind else None
+            else:
+                record = carried.record(k - blind, cv)
+            outputs = plant.step(record["mv_demand"], float(offsets[k]))
+            records.append(record | {"mv": np.asarray(outputs.mv)})
+            if progress is not None and ((k + 1) % REPORT == 0 or k + 1 == total):
+                progress(k + 1, total)
+    return {name: np.stack([record[name] for record in records]) for name in records[0]}
+
+
+def _sample(cv: np.ndarray, setpoint: np.ndarray, mv: np.ndarray) -> Sample:
+    """Of one lane, with its axis."""
+    return Sample(cv[None], setpoint[None], mv[None], np.zeros((1, len(mv)), dtype=bool))
+
+
+def _record(cv: np.ndarray, state: ControllerState, info: StepInfo) -> dict[str, Any]:
+    """What a sample leaves behind, by the names of `Trajectory`."""
+    found = dict(
+        mv_demand=info.mv,
+        move=info.move,
+        plan=info.moves,
+        bias=state.bias,
+        bias_raw=state.bias_raw,
+        quality=info.quality,
+        off=info.off,
+        status=info.status,
+        fallback=info.fallback,
+        objective=info.objective,
+        bound=info.bound,
+        gap=info.gap,
+        nodes=info.nodes,
+        finished_by=info.finished_by,
+        solve_time=info.solve_time,
+    )
+    return {"cv": cv} | {name: np.asarray(value)[0] for name, value in found.items()}
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """No search for garbage among what is there already: compiled programs would keep it busy for a fifth of a second."""
+    if gc.get_freeze_count():  # the caller's business
+        yield
+        return
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()

@@ -1,0 +1,172 @@
+"""A structure as arrays of a size from a short ladder: compiled programs see these, and never the structure itself.
+
+Whatever follows from horizons, blocks, blocking mode and integer steps is built here once, with NumPy. What a structure does
+not fill is padding that changes no result: moves that are fixed at zero, predictions without weight, rows without
+limits. Structures of one size therefore share their programs, and may be lanes of one batch.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxmpc.problem.blocking import (
+    block_members,
+    block_starts,
+    moves_per_block,
+    oscillation_rows,
+    sample_moves,
+    single_step_blocks,
+    window_rows,
+)
+from jaxmpc.problem.structure import Structure
+
+# rungs; beyond the last one, multiples of it
+BLOCKS = (4, 8, 16, 32, 64, 128, 256)
+HORIZON = (32, 64, 128, 256, 384, 512)
+WINDOW = (32, 128, 512)
+
+
+def rung(count: int, ladder: tuple[int, ...]) -> int:
+    """The least rung that holds so many."""
+    return next((r for r in ladder if r >= count), -(-count // ladder[-1]) * ladder[-1])
+
+
+class Size(NamedTuple):
+    """What programs are compiled for, besides the numbers of CVs and MVs.
+
+    Attributes:
+        cvs, mvs: of the process.
+        blocks: moves per MV that are decided.
+        horizon: predictions per CV.
+        future: samples of the shift register, at least the prediction horizon and the coefficients of the model.
+        windows: rows of the predictive mean-move limit per MV; none in other modes.
+        past: moves that the mean-move limit remembers.
+    """
+
+    cvs: int
+    mvs: int
+    blocks: int
+    horizon: int
+    future: int
+    windows: int
+    past: int
+
+    @classmethod
+    def of(cls, structure: Structure, samples: int) -> Size:
+        """The size of a structure with a model of so many coefficients."""
+        return cls(
+            cvs=structure.cv_count,
+            mvs=structure.mv_count,
+            blocks=rung(structure.block_count, BLOCKS),
+            horizon=rung(structure.horizon_count, HORIZON),
+            future=rung(max(structure.prediction_horizon, samples), HORIZON),
+            windows=rung(len(window_rows(structure)), HORIZON) if len(window_rows(structure)) else 0,
+            past=rung(structure.mean_move_window, WINDOW),
+        )
+
+    @property
+    def moves(self) -> int:
+        """Moves that are decided, of all MVs."""
+        return self.mvs * self.blocks
+
+    @property
+    def rows(self) -> int:
+        """Hard rows of one MV (`condense.Rows`)."""
+        return 2 * self.blocks + self.windows
+
+    def __str__(self) -> str:
+        return f"{self.moves} moves and {self.cvs} x {self.horizon} predictions"
+
+    def __or__(self, other: Size) -> Size:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The size that holds structures of both."""
+        return Size(*map(max, self, other))
+
+
+class Layout(eqx.Module):
+    """A structure as arrays, padded to a `Size`.
+
+    Attributes:
+        start, length: first sample and samples of every block; padding has no samples.
+        count: samples that carry the move of a block (`blocking.moves_per_block`).
+        longer: blocks of several samples of which only the first may move (blocking ``inputs``).
+        single: `blocking.single_step_blocks`.
+        coupled: blocks whose move is coupled to the one before by an oscillation row (6.16).
+        window: rows of the predictive mean-move limit (6.6).
+        remaining: past moves that are still inside each of these windows.
+        share: of the past moves in the mean of the reactive mean-move limit (6.6); all zero in other modes.
+        window_length: samples of the window.
+        shift: the plan one sample later, in blocks again.
+        integer: integer MVs.
+        step: their steps [MV unit], 1 for continuous ones.
+        first, last: Hw and Hp.
+        dt: sampling interval [s].
+    """
+
+    start: Int[Array, " block"]
+    length: Int[Array, " block"]
+    count: Float[Array, " block"]
+    longer: Bool[Array, " block"]
+    single: Bool[Array, " block"]
+    coupled: Bool[Array, " block"]
+    window: Float[Array, "window block"]
+    remaining: Float[Array, "window past"]
+    share: Float[Array, " past"]
+    window_length: Float[Array, ""]
+    shift: Float[Array, "block block"]
+    integer: Bool[Array, " mv"]
+    step: Float[Array, " mv"]
+    first: Int[Array, ""]
+    last: Int[Array, ""]
+    dt: Float[Array, ""]
+
+    @property
+    def real(self) -> Bool[Array, " block"]:
+        """Blocks that are no padding."""
+        return self.length > 0
+
+
+@functools.lru_cache(maxsize=256)
+def layout_of(structure: Structure, size: Size) -> Layout:
+    """The arrays of a structure, NumPy's."""
+    blocks, window = structure.block_count, structure.mean_move_window
+
+    def padded(values, *shape) -> np.ndarray:
+        values = np.asarray(values)
+        return np.pad(values, [(0, n - have) for n, have in zip(shape, values.shape, strict=True)])
+
+    coupled = np.zeros(blocks, dtype=bool)
+    pairs = oscillation_rows(structure)
+    coupled[np.argmax(pairs, axis=1) if len(pairs) else []] = True
+    rows = window_rows(structure)
+    predictive = structure.mean_move_mode == "predictive"
+    # the window that ends at sample k of the horizon holds the last window - 1 - k past moves
+    age = np.arange(size.past)[::-1]  # of the past moves, oldest first
+    remaining = (age[None, :] < window - 1 - np.arange(size.windows)[:, None]) & predictive
+    counts = moves_per_block(structure)
+    later = np.eye(structure.control_horizon, k=1)
+    shift = block_members(structure).T @ later @ sample_moves(structure) / counts[:, None]
+    step = structure.integer_step
+    fields: dict[str, Any] = dict(
+        start=padded(block_starts(structure), size.blocks),
+        length=padded(structure.blocks, size.blocks),
+        count=padded(counts.astype(float), size.blocks),
+        longer=padded((np.asarray(structure.blocks) > 1) & (structure.blocking == "inputs"), size.blocks),
+        single=padded(single_step_blocks(structure), size.blocks),
+        coupled=padded(coupled, size.blocks),
+        window=padded(rows, size.windows, size.blocks),
+        remaining=remaining.astype(float),
+        share=np.where((age < window) & (not predictive), 1.0 / window, 0.0),
+        window_length=np.asarray(float(window)),
+        shift=padded(shift, size.blocks, size.blocks),
+        integer=np.array([s is not None for s in step]),
+        step=np.array([1.0 if s is None else s for s in step]),
+        first=np.asarray(structure.first_penalised),
+        last=np.asarray(structure.prediction_horizon),
+        dt=np.asarray(structure.dt),
+    )
+    return Layout(**fields)

@@ -1,0 +1,154 @@
+"""Lanes: many variants of one thing, with what they share kept once; how programs run over them.
+
+A sweep over tunings has one dynamic matrix, and batching it with the rest would cost a copy per lane. `Lanes` therefore
+keeps what has a lane axis apart from what has none. `map_lanes` runs a function over lanes on one device or several, and
+`one_by_one` makes a CPU take one lane after the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, TypeVar
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from jaxmpc.errors import InputError
+
+AXIS = "variant"  # name of the mesh axis
+F = TypeVar("F", bound=Callable)
+T = TypeVar("T")
+
+
+class Lanes(eqx.Module, Generic[T]):
+    """A batch of `T`, split into arrays with a leading lane axis and everything else.
+
+    Attributes:
+        each: a `T` with the arrays that have a lane axis, None in all other places.
+        shared: a `T` with None in these places and what all lanes share in the others.
+    """
+
+    each: Any
+    shared: Any
+
+    @property
+    def count(self) -> int | None:
+        """Number of lanes; None where everything is shared."""
+        sizes = {np.shape(leaf)[0] for leaf in jax.tree.leaves(self.each)}
+        if len(sizes) > 1:
+            raise InputError("lanes", sorted(sizes), "arrays with lane axes of one length")
+        return sizes.pop() if sizes else None
+
+    @property
+    def value(self) -> T:
+        """The `T` whose arrays have a lane axis where `axes` says so; what `jax.vmap` takes."""
+        return eqx.combine(self.each, self.shared)
+
+    @property
+    def axes(self) -> T:
+        """``in_axes`` of `value` for `jax.vmap` and `eqx.filter_vmap`: 0 for a lane axis, None for none."""
+        return jax.tree.map(lambda _: 0, self.each)
+
+    def lane(self, k: int) -> T:
+        """The `T` of lane k alone."""
+        return eqx.combine(jax.tree.map(lambda leaf: leaf[k], self.each), self.shared)
+
+    def take(self, index: np.ndarray) -> Lanes[T]:
+        """The lanes at these positions, repeats allowed; their arrays are NumPy's until `place` moves them."""
+        return Lanes(jax.tree.map(lambda leaf: np.asarray(leaf)[index], self.each), self.shared)
+
+
+def per_lane(value: T) -> Lanes[T]:
+    """Lanes whose every JAX array has a lane axis, such as what `eqx.filter_vmap` returns."""
+    return Lanes(*eqx.partition(value, eqx.is_array))
+
+
+def for_all(value: T) -> Lanes[T]:
+    """Lanes that share everything."""
+    return Lanes(*eqx.partition(value, lambda _: False))
+
+
+def lanes_of(trees: Sequence[T]) -> Lanes[T]:
+    """Lanes of separate trees of one form; a single one is shared by all lanes, however many there are."""
+    nothing = jax.tree.map(lambda _: None, trees[0])
+    if len(trees) == 1:
+        return Lanes(nothing, trees[0])
+    return Lanes(jax.tree.map(lambda *leaves: np.stack(leaves), *trees), nothing)
+
+
+def one_by_one(function: F) -> F:
+    """The function with a `jax.vmap` that on a CPU solves lane after lane, so that none pays for the slowest.
+
+    Loops of lanes that differ in length then end when each is done. Accelerators take all lanes in lockstep.
+    """
+    lane: Any = jax.custom_batching.custom_vmap(function)
+
+    @lane.def_vmap
+    def _(size: int, batched, *arguments):
+        leaves, form = jax.tree.flatten(arguments)
+        mine = jax.tree.leaves(tuple(batched))
+
+        def call(some):
+            some = iter(some)
+            whole = [next(some) if its else v for v, its in zip(leaves, mine, strict=True)]
+            # vmapped once more, this is a batch again
+            return lane(*form.unflatten(whole))
+
+        own = [v for v, its in zip(leaves, mine, strict=True) if its]
+        if jax.default_backend() == "cpu":
+            result: Any = jax.lax.map(call, own)
+        else:
+            axes = jax.tree.map(lambda its: 0 if its else None, tuple(batched))
+            result = jax.vmap(function, in_axes=axes, axis_size=size)(*arguments)
+        return result, jax.tree.map(lambda _: True, result)
+
+    return lane
+
+
+def variant_mesh(devices: Sequence[Any] | None = None) -> Mesh:
+    """A mesh with the one axis `AXIS` over some devices, by default all of this process."""
+    devices = jax.local_devices() if devices is None else devices
+    return Mesh(np.array(list(devices)), (AXIS,))
+
+
+def place(lanes: Lanes[T], mesh: Mesh) -> Lanes[T]:
+    """Move lanes to the devices of a mesh, an equal share to each; the shared part goes to all.
+
+    The number of lanes has to be a multiple of the number of devices.
+    """
+    put = lambda tree, spec: jax.device_put(tree, NamedSharding(mesh, spec))  # noqa: E731
+    arrays, rest = eqx.partition(lanes.shared, eqx.is_array)
+    return Lanes(put(lanes.each, PartitionSpec(AXIS)), eqx.combine(put(arrays, PartitionSpec()), rest))
+
+
+@eqx.filter_jit
+def map_lanes(function: Callable[..., Any], arguments: Sequence[Lanes], mesh: Mesh):
+    """``function(*arguments)`` of every lane; compiled once per function, shapes and static parts, and kept.
+
+    Devices work on their lanes alone and never wait for each other inside the function (a solver loop runs until the
+    slowest lane *of its device* is done).
+
+    Args:
+        function: of one lane's arguments; returns arrays only.
+        arguments: one `Lanes` per argument, on the devices of `mesh` (`place`).
+        mesh: from `variant_mesh`.
+
+    Returns:
+        What `function` returns, with a lane axis first.
+    """
+    own, shared = [a.each for a in arguments], [a.shared for a in arguments]
+    arrays, rest = eqx.partition(shared, eqx.is_array)
+
+    def share(own, arrays):
+        one = lambda lane: function(*map(eqx.combine, lane, arrays, rest))  # noqa: E731
+        return jax.vmap(one)(own)
+
+    if mesh.size == 1:
+        return share(own, arrays)
+    by_lane, everywhere = PartitionSpec(AXIS), PartitionSpec()
+    split = jax.shard_map(
+        share, mesh=mesh, in_specs=(by_lane, everywhere), out_specs=by_lane, check_vma=False
+    )
+    return split(own, arrays)
