@@ -12,7 +12,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Int
 
-from jaxmpc.problem.blocking import moves_per_block, oscillation_rows, window_rows
+from jaxmpc.problem.blocking import coupled_blocks, moves_per_block, window_rows
 from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure
 
@@ -56,15 +56,13 @@ def chains_of(structure: Structure, size: Size, row_low: np.ndarray, row_high: n
         slice(size.blocks, size.blocks + blocks),
         slice(2 * size.blocks, 2 * size.blocks + len(windows)),
     )
-    pairs = oscillation_rows(structure)
-    has_pair = np.isin(np.arange(blocks), np.argmax(pairs, axis=1) if len(pairs) else [])
     return [
         Chain(
             columns=k * blocks + np.arange(blocks),
             counts=moves_per_block(structure),
             low=whole(low[mv, :blocks]),
             high=whole(high[mv, :blocks]),
-            coupled=has_pair & np.isfinite(high[mv, pair]),
+            coupled=coupled_blocks(structure) & np.isfinite(high[mv, pair]),
             windows=windows,
             window_low=low[mv, window],
             window_high=high[mv, window],

@@ -7,7 +7,6 @@ what differs is picked per lane on the device.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -146,8 +145,3 @@ class Relaxer:
         index = np.arange(len(instances.lower))
         lower, upper = np.asarray(instances.lower), np.asarray(instances.upper)
         return self.solve(instances, index, lower, upper, jax.tree.map(np.asarray, warm))
-
-    @functools.cached_property
-    def scale(self) -> np.ndarray:
-        """Scales of the objectives, one per scenario or a single one; see `gap.closes`."""
-        return np.array([c.scale for c in self.constants])

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxmpc.errors import InputError
 from jaxmpc.integer.lower_bound import assignment_order, leading_factor, root_factor, schur_complement
-from jaxmpc.problem.blocking import moves_per_block, oscillation_rows
+from jaxmpc.problem.blocking import coupled_blocks, moves_per_block
 from jaxmpc.problem.condense import CondensedQp
 from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure
@@ -103,9 +103,6 @@ class Constants:
             order, count, room = order[:integers], min(count, integers), max(room, 0)
         mv, block = np.asarray(structure.integer_mvs, dtype=int)[order // blocks], order % blocks
         mine, counts = mv[:, None] == mv[None, :], moves_per_block(structure)
-        coupled = np.zeros(blocks, dtype=bool)
-        pairs = oscillation_rows(structure)
-        coupled[np.argmax(pairs, axis=1) if len(pairs) else []] = True
         place = mv * size.rows + block
 
         def padded(values, absent: float = 0):
@@ -119,7 +116,7 @@ class Constants:
             column=padded(one(self.integer), size.moves),
             position=padded(place),
             pair=padded(size.blocks + place),
-            coupled=padded(coupled[block]),
+            coupled=padded(coupled_blocks(structure)[block]),
             reach=padded((mine & (block[None, :] <= block[:, None])) * counts[block][None, :].astype(float)),
             previous=padded((mine & (block[None, :] == block[:, None] - 1)).astype(float)),
             radius=padded(one(self.radius), np.inf),

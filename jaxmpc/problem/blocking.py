@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxmpc.problem.structure import Structure
 
@@ -44,25 +44,14 @@ def block_members(structure: Structure) -> Float[np.ndarray, "sample block"]:
 
 
 @functools.lru_cache(maxsize=64)
-def position_rows(structure: Structure) -> Float[np.ndarray, "block block"]:
-    """Change of the MV at the end of each block; with a constant move in a block its ends bound all samples."""
-    return np.tril(np.ones((structure.block_count, structure.block_count))) * moves_per_block(structure)
-
-
-@functools.lru_cache(maxsize=64)
-def oscillation_rows(structure: Structure) -> Float[np.ndarray, "row block"]:
-    """Differences of consecutive sample moves that couple two blocks (6.16).
+def coupled_blocks(structure: Structure) -> Bool[np.ndarray, " block"]:
+    """Blocks whose move is coupled to the one before by an oscillation row (6.16).
 
     Differences inside a block are zero in `moves`. In `inputs` a block longer than one sample ends with zero moves,
     so its neighbours are not coupled but limited one by one: see `single_step_blocks`.
     """
-    rows = []
-    for block in range(1, structure.block_count):
-        if structure.blocking == "moves" or structure.blocks[block - 1] == 1:
-            row = np.zeros(structure.block_count)
-            row[block - 1], row[block] = -1.0, 1.0
-            rows.append(row)
-    return np.array(rows).reshape(-1, structure.block_count)
+    alone = np.asarray(structure.blocks) == 1
+    return np.concatenate([[False], alone[:-1] | (structure.blocking == "moves")])
 
 
 @functools.lru_cache(maxsize=64)
@@ -84,30 +73,3 @@ def window_rows(structure: Structure) -> Float[np.ndarray, "sample block"]:
     window = structure.mean_move_window
     delayed[window:] = cumulative[:-window] if window < len(cumulative) else 0.0
     return cumulative - delayed
-
-
-@functools.lru_cache(maxsize=64)
-def hard_rows(structure: Structure) -> Float[np.ndarray, "row n"]:
-    """All hard rows on the moves of all MVs, MV after MV: positions, oscillation (integer MVs), windows.
-
-    Columns are MV-major (`block` fastest). `condense.row_limits` gives the limits in the same order.
-    """
-    n = structure.mv_count * structure.block_count
-    parts = []
-    for mv in range(structure.mv_count):
-        own = [position_rows(structure)]
-        if mv in structure.integer_mvs:
-            own.append(oscillation_rows(structure))
-        own.append(window_rows(structure))
-        rows = np.concatenate(own)
-        wide = np.zeros((len(rows), n))
-        wide[:, mv * structure.block_count : (mv + 1) * structure.block_count] = rows
-        parts.append(wide)
-    return np.concatenate(parts)
-
-
-@functools.lru_cache(maxsize=64)
-def first_position_rows(structure: Structure) -> Int[np.ndarray, " mv"]:
-    """Where the position rows of each MV begin in `hard_rows`; there is one per block."""
-    rows, blocks = hard_rows(structure), structure.block_count
-    return np.array([np.flatnonzero(rows[:, mv * blocks])[0] for mv in range(structure.mv_count)])

@@ -17,8 +17,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxmpc.problem.blocking import (
     block_members,
     block_starts,
+    coupled_blocks,
     moves_per_block,
-    oscillation_rows,
     sample_moves,
     single_step_blocks,
     window_rows,
@@ -133,15 +133,12 @@ class Layout(eqx.Module):
 @functools.lru_cache(maxsize=256)
 def layout_of(structure: Structure, size: Size) -> Layout:
     """The arrays of a structure, NumPy's."""
-    blocks, window = structure.block_count, structure.mean_move_window
+    window = structure.mean_move_window
 
     def padded(values, *shape) -> np.ndarray:
         values = np.asarray(values)
         return np.pad(values, [(0, n - have) for n, have in zip(shape, values.shape, strict=True)])
 
-    coupled = np.zeros(blocks, dtype=bool)
-    pairs = oscillation_rows(structure)
-    coupled[np.argmax(pairs, axis=1) if len(pairs) else []] = True
     rows = window_rows(structure)
     predictive = structure.mean_move_mode == "predictive"
     # the window that ends at sample k of the horizon holds the last window - 1 - k past moves
@@ -157,7 +154,7 @@ def layout_of(structure: Structure, size: Size) -> Layout:
         count=padded(counts.astype(float), size.blocks),
         longer=padded((np.asarray(structure.blocks) > 1) & (structure.blocking == "inputs"), size.blocks),
         single=padded(single_step_blocks(structure), size.blocks),
-        coupled=padded(coupled, size.blocks),
+        coupled=padded(coupled_blocks(structure), size.blocks),
         window=padded(rows, size.windows, size.blocks),
         remaining=remaining.astype(float),
         share=np.where((age < window) & (not predictive), 1.0 / window, 0.0),

@@ -3,7 +3,7 @@
 - `compilation`: pauses in which something is compiled are said (`compiling_for`, `told`, `say`); clocks without them
   (`clock`, `compiled_since`).
 - `cache`: the private folder of what was built (`cache_folder`, `sealed`, `read_sealed`).
-- `threads`: compiled programs side by side on the cores (`cores`, `parts_of`, `side_by_side`, `compile_together`).
+- `threads`: compiled programs side by side on the cores (`cores`, `parts_of`, `side_by_side`).
 - `packing`: many small arrays as one between host and device (`Packing`, `flattened`, `rebuilt`).
 - `interrupts`: Ctrl-C on the command line (`front_door`, `report`, `held`, `last_words`, `in_the_end`,
   `before_leaving`, `being_left`, `run_program`).

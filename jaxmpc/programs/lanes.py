@@ -1,8 +1,7 @@
 """Lanes: many variants of one thing, with what they share kept once; how programs run over them.
 
 A sweep over tunings has one dynamic matrix, and batching it with the rest would cost a copy per lane. `Lanes` therefore
-keeps what has a lane axis apart from what has none. `map_lanes` runs a function over lanes on one device or several, and
-`one_by_one` makes a CPU take one lane after the other.
+keeps what has a lane axis apart from what has none, and `one_by_one` makes a CPU take one lane after the other.
 """
 
 from __future__ import annotations
@@ -13,11 +12,9 @@ from typing import Any, Generic, TypeVar
 import equinox as eqx
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxmpc.errors import InputError
 
-AXIS = "variant"  # name of the mesh axis
 F = TypeVar("F", bound=Callable)
 T = TypeVar("T")
 
@@ -56,7 +53,7 @@ class Lanes(eqx.Module, Generic[T]):
         return eqx.combine(jax.tree.map(lambda leaf: leaf[k], self.each), self.shared)
 
     def take(self, index: np.ndarray) -> Lanes[T]:
-        """The lanes at these positions, repeats allowed; their arrays are NumPy's until `place` moves them."""
+        """The lanes at these positions, repeats allowed; their arrays are NumPy's."""
         return Lanes(jax.tree.map(lambda leaf: np.asarray(leaf)[index], self.each), self.shared)
 
 
@@ -105,50 +102,3 @@ def one_by_one(function: F) -> F:
         return result, jax.tree.map(lambda _: True, result)
 
     return lane
-
-
-def variant_mesh(devices: Sequence[Any] | None = None) -> Mesh:
-    """A mesh with the one axis `AXIS` over some devices, by default all of this process."""
-    devices = jax.local_devices() if devices is None else devices
-    return Mesh(np.array(list(devices)), (AXIS,))
-
-
-def place(lanes: Lanes[T], mesh: Mesh) -> Lanes[T]:
-    """Move lanes to the devices of a mesh, an equal share to each; the shared part goes to all.
-
-    The number of lanes has to be a multiple of the number of devices.
-    """
-    put = lambda tree, spec: jax.device_put(tree, NamedSharding(mesh, spec))  # noqa: E731
-    arrays, rest = eqx.partition(lanes.shared, eqx.is_array)
-    return Lanes(put(lanes.each, PartitionSpec(AXIS)), eqx.combine(put(arrays, PartitionSpec()), rest))
-
-
-@eqx.filter_jit
-def map_lanes(function: Callable[..., Any], arguments: Sequence[Lanes], mesh: Mesh):
-    """``function(*arguments)`` of every lane; compiled once per function, shapes and static parts, and kept.
-
-    Devices work on their lanes alone and never wait for each other inside the function (a solver loop runs until the
-    slowest lane *of its device* is done).
-
-    Args:
-        function: of one lane's arguments; returns arrays only.
-        arguments: one `Lanes` per argument, on the devices of `mesh` (`place`).
-        mesh: from `variant_mesh`.
-
-    Returns:
-        What `function` returns, with a lane axis first.
-    """
-    own, shared = [a.each for a in arguments], [a.shared for a in arguments]
-    arrays, rest = eqx.partition(shared, eqx.is_array)
-
-    def share(own, arrays):
-        one = lambda lane: function(*map(eqx.combine, lane, arrays, rest))  # noqa: E731
-        return jax.vmap(one)(own)
-
-    if mesh.size == 1:
-        return share(own, arrays)
-    by_lane, everywhere = PartitionSpec(AXIS), PartitionSpec()
-    split = jax.shard_map(
-        share, mesh=mesh, in_specs=(by_lane, everywhere), out_specs=by_lane, check_vma=False
-    )
-    return split(own, arrays)

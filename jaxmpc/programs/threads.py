@@ -42,11 +42,6 @@ def parts_of(count: int, most: int, *, cut: bool = False) -> list[np.ndarray]:
     return [np.minimum(np.arange(size) + k * size, count - 1) for k in range(number)]
 
 
-def compile_together(*first_calls: Callable[[], Any]) -> None:
-    """Make the first calls of some programs at once; they are compiled without Python's lock."""
-    side_by_side(lambda call, _: call(), first_calls)
-
-
 def side_by_side(work: Callable[[T, Callable[[], bool]], Any], parts: Sequence[T]) -> list[Any]:
     """Results of work on every part, in order.
 
