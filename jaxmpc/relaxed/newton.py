@@ -46,7 +46,8 @@ FLAT = 0.3  # share of its slope at the start that the merit may have where a li
 UPHILL = 1e-3  # the same for a merit that may be above that at the start
 NOTHING = 0.01  # gradient without moves, and moves, below which there is next to nothing to gain
 SETTLED, EXACT = 1e-7, 1e-12  # share of the gradient without moves left when prices are taken, and at the end
-ROUNDED, STALLED = 1e-10, 0.3  # share that rounding may be, and what a step then leaves of what there was
+# 1e-10 ended a step of the thesis run too early
+ROUNDED, STALLED = 1e-11, 0.3  # share that rounding may be, and what a step then leaves of what there was
 UNPAID, OUTSIDE = (
     1e-14,
     1e-9,
