@@ -172,15 +172,12 @@ class Controllers:
         """Which controllers have integer MVs."""
         return np.array([bool(s.integer_mvs) for s in self.scenarios.structures])
 
-    def over_horizon(self, setpoint: np.ndarray) -> np.ndarray:
-        """Setpoints over the shift register, the last one repeated: ``"scenario future cv"``."""
-        setpoint = np.asarray(setpoint)
-        if setpoint.ndim == 2:
-            setpoint = setpoint[:, None]
-        more = self.size.future - setpoint.shape[1]
-        if more < 0:
-            return setpoint[:, : self.size.future]
-        return np.concatenate([setpoint, np.repeat(setpoint[:, -1:], more, axis=1)], axis=1)
+    def over_horizon(self, setpoint: Any) -> Any:
+        """Setpoints over the shift register, the last one repeated: ``"scenario future cv"``; NumPy's unless traced."""
+        xp: Any = jnp if _traced(setpoint) else np
+        rows = setpoint[:, None] if setpoint.ndim == 2 else setpoint
+        more = max(self.size.future - rows.shape[1], 0)
+        return xp.concatenate([rows, xp.repeat(rows[:, -1:], more, axis=1)], axis=1)[:, : self.size.future]
 
     def _packing(self, given: Any) -> tuple[Packing, Packing]:
         """Of what goes into a step and what comes out."""
@@ -197,22 +194,20 @@ class Controllers:
         x, good = found.x.copy(), found.closed & np.isfinite(found.x).all(axis=1)
         fields = {
             name: np.array(getattr(info, name))
-            for name in ("status", "objective", "bound", "gap", "nodes", "finished_by")
+            for name in ("status", "fallback", "objective", "bound", "gap", "nodes", "finished_by")
         }
         seconds = seconds.copy()
         for i, result in zip(which, results, strict=True):
             good[i] = result.x is not None
             if result.x is not None:
                 x[i] = result.x
-            value, bound = (result.value, result.bound) if good[i] else (np.nan, np.nan)
-            fields["objective"][i], fields["bound"][i], fields["nodes"][i] = value, bound, result.nodes
-            fields["gap"][i] = relative_gap(value, bound, moment.unit[i])
-            fields["status"][i] = result.status
-            fields["finished_by"][i] = codes.finisher_code(result.finished_by) if good[i] else 0
+            said = said_of(result, float(moment.unit[i]))
+            for name, values in fields.items():
+                values[i] = said[name]
             seconds[i] = result.seconds
         leaves, form = self.flat
         state, moves = jax.tree.map(np.asarray, _carry_out(leaves, moment, x, good, form))
-        changed = dict(fields, move=moves[:, 0], mv=state.mv, moves=moves, fallback=~good)
+        changed = dict(fields, move=moves[:, 0], mv=state.mv, moves=moves)
         return state, dataclasses.replace(info, **changed), seconds
 
     def finish_open(self, moment: Moment, which: np.ndarray, spent: np.ndarray) -> list[SearchResult]:
@@ -238,8 +233,8 @@ class Controllers:
         controllers = self._reduced(off) if off[index].any() else self
         try:
             with compiling_for(str(self.size)):
-                results, _ = finish_steps(
-                    lambda envelope: controllers.relaxer(envelope).part(index),
+                return finish_steps(
+                    functools.cache(lambda envelope: controllers.relaxer(envelope).part(index)),
                     own.instance,
                     Relaxations.of(own.decision.root),
                     previous_moves=own.state.plan,  # pyright: ignore[reportArgumentType]
@@ -252,7 +247,6 @@ class Controllers:
             if not self.decided:
                 raise
             return [SearchResult(None, np.inf, -np.inf, codes.FAILED, None, 0, seconds=spent)] * len(index)
-        return results
 
     def _reduced(self, off: Bool[np.ndarray, "scenario cv"]) -> Controllers:
         """These controllers without the CVs that are switched off."""
@@ -270,6 +264,21 @@ class Controllers:
             while len(self._without) > KEPT:
                 self._without.pop(next(iter(self._without)))
         return self._without[pattern]
+
+
+def said_of(result: SearchResult, unit: float) -> dict[str, Any]:
+    """What a step that was decided on the host says of itself, by the names of `StepInfo` and `Trajectory`."""
+    found = result.x is not None
+    value, bound = (result.value, result.bound) if found else (np.nan, np.nan)
+    return {
+        "status": result.status,
+        "fallback": not found,
+        "objective": value,
+        "bound": bound,
+        "gap": relative_gap(value, bound, unit),
+        "nodes": result.nodes,
+        "finished_by": codes.finisher_code(result.finished_by) if found else 0,
+    }
 
 
 @functools.partial(jax.jit, static_argnames="form")
@@ -400,10 +409,7 @@ class Controller:
             return self._shown(*one_lane(self.lanes.decide(lane, of_lane)))
         if self.structure.integer_mvs:
             raise TypeError("step() of a controller with integer MVs runs on the host and cannot be traced")
-        given = jnp.asarray(sample.setpoint)
-        rows = given[None] if given.ndim == 1 else given
-        more = jnp.repeat(rows[-1:], max(self.core.size.future - rows.shape[0], 0), axis=0)
-        sample = sample._replace(setpoint=jnp.concatenate([rows, more])[: self.core.size.future])
+        sample = sample._replace(setpoint=self.lanes.over_horizon(sample.setpoint[None])[0])
         return self._shown(*self.core.conclude(self.core.consider(state, sample, self.gap)))
 
     def _shown(self, state: ControllerState, info: StepInfo) -> tuple[ControllerState, StepInfo]:

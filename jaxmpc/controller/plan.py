@@ -40,7 +40,6 @@ from jaxmpc.programs.lanes import Lanes
 from jaxmpc.programs.packing import Packing, rebuilt
 from jaxmpc.relaxed.gap import check_gap, check_time_limit, closes, relative_gap
 from jaxmpc.relaxed.newton import WarmStart
-from jaxmpc.relaxed.solve import cold_start
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,9 +134,9 @@ class Planner:
         whole = np.asarray(_matrix(core.layout, core.coefficients, np.arange(1, size.future + 1)))
         self.matrix = whole[:, : structure.prediction_horizon, :, : structure.block_count]
         zeros = lambda *shape: np.zeros((1, *shape))  # noqa: E731
-        self._blank = zeros(size.future, size.cvs), zeros(size.mvs), zeros(size.past, size.mvs)
-        instance = jax.eval_shape(_posed_shapes, core, self._blank)
-        self._cold = jax.tree.map(lambda v: np.zeros((1, *v.shape)), instance)
+        self._no_past = zeros(size.past, size.mvs)
+        cold = jax.eval_shape(core.init, np.zeros(size.cvs), np.zeros(size.mvs)).warm
+        self._cold = jax.tree.map(lambda v: np.zeros((1, *v.shape)), cold)
         self._packings: tuple[Packing, Packing] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -180,7 +179,7 @@ class Planner:
         gap, time_limit = check_gap("gap", gap), check_time_limit("time_limit", time_limit)
         as_array = lambda v: np.asarray(v, dtype=np.float64)  # noqa: E731
         free_response, setpoint, mv_now = as_array(free_response), as_array(setpoint), as_array(mv_now)
-        past: np.ndarray = self._blank[2].copy()
+        past: np.ndarray = self._no_past.copy()
         if past_moves is not None:
             moves = as_array(past_moves)[-past.shape[1] :]
             past[0, past.shape[1] - len(moves) :] = moves
@@ -224,7 +223,7 @@ class Planner:
         previous = np.zeros((1, self.controllers.size.blocks, self.controllers.size.mvs))
         if previous_moves is not None:
             previous[0, : self.structure.block_count] = previous_moves
-        results, _ = finish_steps(
+        (result,) = finish_steps(
             self.controllers.relaxer,
             posed.instance,
             Relaxations.of(posed.decision.root),
@@ -234,7 +233,7 @@ class Planner:
             finish=finish,
             spent=spent,
         )
-        return results[0]
+        return result
 
     def _relaxed(self, posed: Posed, gap: float) -> SearchResult:
         """The problem without integers: one relaxation."""
@@ -333,23 +332,6 @@ def _repair(structure: Structure, size: Size, instance: QpInstance, x: np.ndarra
 
 
 _matrix = jax.jit(dynamic_matrix)
-
-
-def _posed_shapes(core: Core, blank) -> WarmStart:
-    """A start of a core's problems."""
-    response, mv, past = (v[0] for v in blank)
-    instance = make_instance(
-        core.layout,
-        core.size,
-        core.tuning,
-        core.qp,
-        free_response=response,
-        setpoint=response,
-        mv_now=mv,
-        last_move=mv,
-        past_moves=past,
-    )
-    return cold_start(core.qp, instance)
 
 
 def solve_plan(

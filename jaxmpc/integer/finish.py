@@ -36,7 +36,7 @@ def finish_steps(
     time_limit: float | None,
     finish: str,
     spent: float = 0.0,
-) -> tuple[list[SearchResult], Relaxations]:
+) -> list[SearchResult]:
     """Solve one step of every scenario; all have the same integer moves.
 
     Args:
@@ -50,7 +50,7 @@ def finish_steps(
         spent: seconds that every scenario has taken already.
 
     Returns:
-        How the steps ended, and their relaxations.
+        How the steps ended.
 
     Raises:
         InputError: for ranges of whole moves that cannot be searched.
@@ -70,7 +70,7 @@ def finish_steps(
         own = relaxer.scenario(i)
         wanted = moves.T.reshape(-1)[own.integer] / own.scales[own.integer]
         starts.append([np.clip(np.nan_to_num(wanted), -1e6, 1e6)])
-    results = solve_integers(
+    return solve_integers(
         relaxer,
         instances,
         root,
@@ -80,7 +80,6 @@ def finish_steps(
         finish=finish,
         spent=spent + clock.seconds / len(starts),
     )
-    return results, root
 
 
 def _bounded(relaxer_of, instances: QpInstance) -> tuple[np.ndarray, np.ndarray]:

@@ -17,7 +17,6 @@ import numpy as np
 from jaxmpc.integer.search import Relaxed, relax
 from jaxmpc.integer.tables import Constants
 from jaxmpc.problem.instance import QpInstance
-from jaxmpc.programs.clock import timed
 from jaxmpc.programs.lanes import Lanes
 from jaxmpc.relaxed.newton import WarmStart
 from jaxmpc.relaxed.solve import cold_start
@@ -128,7 +127,7 @@ class Relaxer:
             pad = np.minimum(begin + np.arange(LANES), count - 1)
             some = jax.tree.map(lambda leaf, pad=pad: leaf[pad], (index, lower, upper, starts))
             used = min(LANES, count - begin)
-            solved = timed(_relax, self.qps, instances, *some, used)
+            solved = _relax(self.qps, instances, *some, used)
             parts.append(jax.tree.map(lambda leaf, used=used: np.asarray(leaf)[:used], solved))
         join = lambda *leaves: leaves[0] if len(leaves) == 1 else np.concatenate(leaves)  # noqa: E731
         return Relaxations.of(jax.tree.map(join, *parts))

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxmpc import status as codes
-from jaxmpc.controller.controller import Controllers, considered
+from jaxmpc.controller.controller import Controllers, considered, said_of
 from jaxmpc.controller.core import Core, Moment
 from jaxmpc.controller.measurement import received
 from jaxmpc.controller.sample import Sample
@@ -261,18 +261,9 @@ class _Run:
         x, good = now.x.copy(), now.good.copy()
         for i, result in zip(which, results, strict=True):
             good[i] = result.x is not None
-            value, bound = (result.value, result.bound) if good[i] else (np.nan, np.nan)
-            found = {
-                "status": result.status,
-                "fallback": not good[i],
-                "nodes": result.nodes,
-                "finished_by": codes.finisher_code(result.finished_by) if good[i] else 0,
-                "objective": value,
-                "bound": bound,
-                "gap": relative_gap(value, bound, now.moment.unit[i]),
-            }
-            for name in found.keys() & fields.keys():
-                fields[name][i, at] = found[name]
+            said = said_of(result, float(now.moment.unit[i]))
+            for name in said.keys() & fields.keys():
+                fields[name][i, at] = said[name]
             if "solve_time" in fields:
                 fields["solve_time"][i, at] += result.seconds
             if result.x is not None:

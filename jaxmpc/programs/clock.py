@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -37,8 +36,3 @@ class Clock:
     def seconds(self) -> float:
         """Since the start [s]."""
         return max(time.perf_counter() - self.begin - (_here.seconds - self.compiled), 0.0)
-
-
-def timed(call: Callable[..., Any], *arguments: Any) -> Any:
-    """The result of a compiled call, computed."""
-    return jax.block_until_ready(call(*arguments))

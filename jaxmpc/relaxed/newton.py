@@ -134,10 +134,10 @@ class _Proximal(NamedTuple):
         row = stiffness * p.qp.row_unit
         of_one = stiffness / jnp.maximum(p.qp.rows.size, TINY)
         hard = p.qp.rows.spread(of_one, p.row_low.shape[0] // of_one.shape[0])
-        # the same along the horizon, so that limits that are active side by side are summed at once
         # a limit that costs much has far to go with its price
         urgent = jnp.clip(STEEPER * stiffness * p.slack_price, stiffness, jnp.maximum(stiffness, STIFF))
         horizon = p.limit_high.shape[0] // p.slack_unit.shape[0]
+        # the same along the horizon, so that limits that are active side by side are summed at once
         limit = (
             jnp.repeat(urgent[: p.slack_unit.shape[0]] / p.slack_unit**2, horizon)
             if p.qp.has_limits

@@ -39,7 +39,8 @@ class Lanes:
 
     def __init__(self, instances: Instances):
         self.structure = instances.structure
-        self.core = Controller(instances.structure, instances.tuning, instances.model).core
+        self.controller = Controller(instances.structure, instances.tuning, instances.model)
+        self.core = self.controller.core
         self.qp = self.core.qp
         self.instances = self._build(instances.now)
         self.cold: Any = jax.jit(jax.vmap(lambda instance: cold_start(self.qp, instance)))(self.instances)
@@ -48,8 +49,7 @@ class Lanes:
     def _build(self, problems: Problems):
         core = self.core
         free, setpoint, now, last, past = (np.asarray(values) for values in problems)
-        more = core.size.future - free.shape[1]
-        whole = lambda v: np.concatenate([v, np.repeat(v[:, -1:], more, axis=1)], axis=1)  # noqa: E731
+        whole = self.controller.lanes.over_horizon
         past = np.pad(past, ((0, 0), (core.size.past - past.shape[1], 0), (0, 0)))
 
         def one(free, setpoint, now, last, past):
