@@ -6,7 +6,8 @@ term with its price (Hermans, Themelis and Patrinos 2022, QPALM), whose gradient
 is exact as soon as the classification is right. From a start with prices that takes one to three steps. Without
 any, the terms are soft at first and stiffer with every problem solved, which finds the classification in about four. Where
 kinks lie so close that steps get nowhere, they are damped and the terms soft again.
-CV limits are rows like others, with what is given up of them (eps) as further variables.
+CV limits are rows like others, whose prices per CV and side spend no more than eps costs: eps itself, which the
+augmented Lagrangian is least in, follows from these prices (a projection onto the simplex; Michelot 1986).
 What is returned is judged by its own duality gap.
 """
 
@@ -18,7 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxmpc.relaxed.problem import (
     RIDGE,
@@ -35,12 +36,15 @@ from jaxmpc.relaxed.problem import (
 STEPS = 150  # Newton steps after which a lane starts again from nothing, by the next row of `ATTEMPTS`
 # curvature of a proximal term against the largest of the Hessian: without prices, in the end, and the least there is
 SOFT, STIFF, SOFTEST = 1.0, 1e4, 0.1
-# the first and the last of these curvatures: where one lets steps go in circles, another may not
-ATTEMPTS = np.array([(SOFT, STIFF), (100.0, 1e5), (10.0, 1e3), (1000.0, 1e6)])
+# the first and the last of these curvatures, and that of CV limits per price of eps: where one lets steps go in circles,
+# another may not
+ATTEMPTS = np.array([(SOFT, STIFF, 0.3), (100.0, 1e5, 100.0), (10.0, 1e3, 0.3), (1000.0, 1e6, 100.0)])
 STIFFEN = 10.0  # what it grows by when the problem with the present prices is solved, and falls by after a short step
-SHORT = 0.003  # step length from which on the next step is damped
+SHORT, SHORTER = (
+    0.03,
+    0.003,
+)  # step length from which on the next step is damped: from stiff terms, and from softer ones
 DAMPING, MOST_DAMPING, DAMP = 1e-4, 10.0, 10.0  # on the diagonal after short steps, and what that changes by
-STEEPER = 100.0  # stiffness of CV limits per price of eps, against that of other terms
 SEARCHES = 12  # trials of the line search
 FLAT = 0.3  # share of its slope at the start that the merit may have where a line search ends
 UPHILL = 1e-3  # the same for a merit that may be above that at the start
@@ -48,10 +52,8 @@ NOTHING = 0.01  # gradient without moves, and moves, below which there is next t
 SETTLED, EXACT = 1e-7, 1e-12  # share of the gradient without moves left when prices are taken, and at the end
 # 1e-10 ended a step of the thesis run too early
 ROUNDED, STALLED = 1e-11, 0.3  # share that rounding may be, and what a step then leaves of what there was
-UNPAID, OUTSIDE = (
-    1e-14,
-    1e-9,
-)  # last change of the prices, squared, and what it leaves hard rows violated by, at the end
+# at the end, the last change of the prices, squared, and what it leaves hard rows violated by
+UNPAID, OUTSIDE = 1e-14, 1e-9
 
 
 class WarmStart(eqx.Module):
@@ -87,21 +89,19 @@ def warm_start_of(solution: QpSolution) -> WarmStart:
 
 
 class _Families(NamedTuple):
-    """Values per deadzone, level of the envelope, CV limit (upper positive), eps, limit of x and hard row."""
+    """Values per deadzone, level of the envelope, CV limit (upper positive), limit of x and hard row."""
 
     row: Array
     envelope: Array
     limit: Array
-    slack: Array
     box: Array
     hard: Array
 
 
 class _Point(NamedTuple):
-    """Moves, eps, and what follows from the moves: t and the hard rows."""
+    """Moves, and what follows from them: t and the hard rows."""
 
     x: Array
-    slack: Array
     t: Array
     w: Array
 
@@ -128,46 +128,62 @@ class _Proximal(NamedTuple):
     share: Array
 
     @classmethod
-    def of(cls, problem: Prepared, stiffness) -> _Proximal:
-        """With so much curvature per term."""
+    def of(cls, problem: Prepared, stiffness, steeper) -> _Proximal:
+        """With so much curvature per term, and for CV limits this much more per price of eps."""
         p = problem
         row = stiffness * p.qp.row_unit
         of_one = stiffness / jnp.maximum(p.qp.rows.size, TINY)
         hard = p.qp.rows.spread(of_one, p.row_low.shape[0] // of_one.shape[0])
-        # a limit that costs much has far to go with its price
-        urgent = jnp.clip(STEEPER * stiffness * p.slack_price, stiffness, jnp.maximum(stiffness, STIFF))
-        horizon = p.limit_high.shape[0] // p.slack_unit.shape[0]
-        # the same along the horizon, so that limits that are active side by side are summed at once
-        limit = (
-            jnp.repeat(urgent[: p.slack_unit.shape[0]] / p.slack_unit**2, horizon)
-            if p.qp.has_limits
-            else urgent
-        )
-        sigma = _Families(row, stiffness, limit, urgent, stiffness, hard)
+        limit = p.limit_high  # none
+        if p.qp.has_limits:
+            # a limit that costs much has far to go with its price
+            reach = jnp.maximum(p.qp.reach, TINY)
+            urgent = steeper * stiffness * p.slack_price * reach
+            urgent = jnp.clip(urgent, stiffness, jnp.maximum(stiffness, STIFF))
+            # the same along the horizon, so that limits that are active side by side are summed at once
+            limit = jnp.repeat(urgent / reach**2, p.limit_high.shape[0] // reach.shape[0])
+        sigma = _Families(row, stiffness, limit, stiffness, hard)
         return cls(p, sigma, p.curvature / (p.curvature + row))
 
-    def prices(self, point: _Point, old: _Families, quiet: Bool[Array, ""]) -> _Families:
-        """New prices at a point; those of CV limits are looked at only where these are not quiet."""
+    def prices(self, point: _Point, old: _Families) -> _Families:
+        """New prices at a point."""
         p, sigma = self.problem, self.sigma
         excess = self._excess(point, old)
         own = self._beyond(point, old)
-
-        def limits():
-            high, low = p.given_up(point.slack)
-            limit = _away(sigma.limit, point.t, old.limit, p.limit_low - low, p.limit_high + high)
-            return limit, jnp.minimum(sigma.slack * point.slack + old.slack, p.slack_price)
-
-        limit, slack = old.limit, old.slack  # none
-        if p.qp.has_limits:
-            limit, slack = jax.lax.cond(quiet, lambda: (limit, slack), limits)
         return _Families(
             row=self.share * excess + (1.0 - self.share) * jnp.clip(excess, -p.steepness, p.steepness),
             envelope=jnp.clip(own, -p.steep, p.steep),
-            limit=limit,
-            slack=slack,
+            limit=self._limits(point, old) if p.qp.has_limits else old.limit,
             box=_away(sigma.box, point.x, old.box, p.lower, p.upper),
             hard=_away(sigma.hard, point.w, old.hard, p.row_low, p.row_high),
         )
+
+    def _limits(self, point: _Point, old: _Families) -> Float[Array, " limit"]:
+        """Prices of the CV limits: what sigma t + price exceeds sigma (limit + eps) by, with the best eps."""
+        p, beyond = self.problem, self._outside(point, old)
+        ones = np.ones(beyond.shape[0] // p.slack_price.shape[0])
+
+        def affordable(
+            beyond,
+        ):  # the same less a level per CV, sigma eps, above which they add up to the price of eps
+            def rise(levels):
+                _, level = levels
+                above = beyond > level[:, None]
+                sum_, number = jnp.where(above, beyond, 0.0) @ ones, above.astype(level.dtype) @ ones
+                return level, jnp.maximum(level, (sum_ - p.slack_price) / jnp.maximum(number, 1.0))
+
+            start = jnp.zeros(p.slack_price.shape)
+            _, level = jax.lax.while_loop(
+                lambda levels: jnp.any(levels[1] > levels[0]), rise, (start - 1.0, start)
+            )
+            return jnp.maximum(beyond - level[:, None], 0.0).reshape(-1)
+
+        def project():
+            by_cv = p.by_cv(beyond)
+            return affordable(jnp.maximum(by_cv, 0.0)) - affordable(jnp.maximum(-by_cv, 0.0))
+
+        within = jnp.all(p.by_cv(jnp.abs(beyond)) @ ones <= p.slack_price)
+        return jax.lax.cond(within, lambda: beyond, project)
 
     def slopes(self, point: _Point, old: _Families, new: _Families) -> Slopes:
         """Derivatives of the new prices."""
@@ -181,8 +197,7 @@ class _Proximal(NamedTuple):
             level=jnp.where(excess > 0.0, sigma.row * self.share, 0.0),
             sharp=jnp.where(at_edge, sigma.row * (1.0 - self.share), 0.0),
             limit=active(new.limit, sigma.limit),
-            upper=new.limit > 0.0,
-            slack=jnp.where(new.slack < p.slack_price, sigma.slack, 0.0),
+            beyond=self._outside(point, old) if p.qp.has_limits else new.limit,
             move=active(new.box, sigma.box) + bend,
             hard=active(new.hard, sigma.hard),
         )
@@ -190,27 +205,22 @@ class _Proximal(NamedTuple):
     def _excess(self, point: _Point, old: _Families):
         return _away(self.sigma.row, point.t, old.row, -self.problem.qp.deadzone, self.problem.qp.deadzone)
 
+    def _outside(self, point: _Point, old: _Families):
+        return _away(self.sigma.limit, point.t, old.limit, self.problem.limit_low, self.problem.limit_high)
+
     def _beyond(self, point: _Point, old: _Families):
         return _away(self.sigma.envelope, point.x, old.envelope, -self.problem.qp.knot, self.problem.qp.knot)
 
-    def quiet(self, point: _Point, old: _Families) -> Bool[Array, ""]:
-        """Whether the CV limits have no prices and are not reached."""
+    def gradient(self, x, prices: _Families) -> Float[Array, " n"]:
+        """Gradient of the augmented Lagrangian, given the new prices at x."""
         p = self.problem
-        inside = jnp.all(
-            (point.t[: len(p.limit_low)] >= p.limit_low) & (point.t[: len(p.limit_low)] <= p.limit_high)
-        )
-        return inside & ~(jnp.any(old.limit != 0.0) | jnp.any(point.slack != 0.0) | jnp.any(old.slack != 0.0))
+        force = p.hessian @ x + p.linear + p.pull(self.net(prices))
+        force += prices.box + jnp.sum(prices.envelope, axis=0) + p.qp.rows.pull(prices.hard)
+        return p.keep * force
 
-    def gradient(self, x, prices: _Families, quiet: Bool[Array, ""]) -> Float[Array, " m"]:
-        """Gradient of the augmented Lagrangian in moves and eps, given the new prices at x."""
-        p = self.problem
-        net = prices.row + prices.limit if p.qp.has_limits else prices.row
-        force = p.hessian @ x + p.linear + p.pull(net) + prices.box + jnp.sum(prices.envelope, axis=0)
-        force = p.keep * (force + p.qp.rows.pull(prices.hard))
-        if not p.qp.has_limits:
-            return force
-        spent = jax.lax.cond(quiet, lambda: prices.slack, lambda: p.spent(prices.limit))
-        return jnp.concatenate([force, prices.slack - jnp.tile(p.slack_unit, 2) * spent])
+    def net(self, prices: _Families) -> Float[Array, " prediction"]:
+        """Prices of the predictions."""
+        return prices.row + prices.limit if self.problem.qp.has_limits else prices.row
 
 
 def _away(sigma, value, price, low, high):
@@ -229,43 +239,33 @@ def refine(problem: Prepared, start: WarmStart) -> QpSolution:
     Returns:
         The solution, judged by `relaxed.problem.conclude`.
     """
-    p, keep, unit, moves = problem, problem.keep, problem.unit, problem.lower.shape[0]
+    p, keep, unit = problem, problem.keep, problem.unit
     largest = jnp.max(jnp.abs(p.linear))
 
     def moved(point: _Point, direction: _Point, alpha) -> _Point:
         return jax.tree.map(lambda v, d: v + alpha * d, point, direction)
 
     def step(state: _State) -> _State:
-        proximal = _Proximal.of(p, state.stiffness)
+        attempt = jnp.asarray(ATTEMPTS)[state.steps // STEPS]
+        proximal = _Proximal.of(p, state.stiffness, attempt[2])
         point = state.point
-        quiet = proximal.quiet(point, state.prices)
-        prices = proximal.prices(point, state.prices, quiet)
-        gradient = proximal.gradient(point.x, prices, quiet)
+        prices = proximal.prices(point, state.prices)
+        gradient = proximal.gradient(point.x, prices)
         matrix = p.proximal_matrix(proximal.slopes(point, state.prices, prices), state.ridge)
         way = -solve_positive(matrix, gradient)
-        dx, slack = keep * way[:moves], way[moves:]
-        direction = _Point(dx, slack, p.respond(dx), p.qp.rows.of(dx))
+        dx = keep * way
+        direction = _Point(dx, p.respond(dx), p.qp.rows.of(dx))
         bend, slope = dx @ (p.hessian @ dx), (p.hessian @ point.x + p.linear) @ dx
 
-        # limits that hold at both ends of a full step hold on the way
-        silent = quiet & proximal.quiet(moved(point, direction, 1.0), state.prices)
-
-        def of_limits(new: _Families):
-            own = total(new.limit * direction.t) + new.slack @ direction.slack
-            return own - (jnp.tile(p.slack_unit, 2) * direction.slack) @ p.spent(new.limit)
-
         def along(alpha):  # derivative of the merit along the direction, increasing in alpha
-            new = proximal.prices(moved(point, direction, alpha), state.prices, silent)
-            change = slope + alpha * bend + total(new.row * direction.t) + new.hard @ direction.w
-            change += (new.box + jnp.sum(new.envelope, axis=0)) @ dx
-            if p.qp.has_limits:
-                change += jax.lax.cond(silent, lambda _: jnp.zeros(()), of_limits, new)
-            return change
+            new = proximal.prices(moved(point, direction, alpha), state.prices)
+            change = slope + alpha * bend + total(proximal.net(new) * direction.t) + new.hard @ direction.w
+            return change + (new.box + jnp.sum(new.envelope, axis=0)) @ dx
 
         alpha = _search(along, gradient @ way)
         point = moved(point, direction, alpha)
-        prices = proximal.prices(point, state.prices, silent)
-        left = jnp.max(jnp.abs(proximal.gradient(point.x, prices, silent)))
+        prices = proximal.prices(point, state.prices)
+        left = jnp.max(jnp.abs(proximal.gradient(point.x, prices)))
         # where there is next to nothing to gain, the gap has to be small against a small share of the unit
         at_play = NOTHING + largest + jnp.max(jnp.abs(point.x))
         settled, exact = left < SETTLED * (1.0 + largest), left < EXACT * at_play
@@ -273,12 +273,11 @@ def refine(problem: Prepared, start: WarmStart) -> QpSolution:
         change = sum(jnp.sum(g**2 / sigma) for g, sigma in zip(gained, proximal.sigma, strict=True))
         outside = jnp.max(jnp.abs(gained.hard) / proximal.sigma.hard, initial=0.0)
         # a kink close by stops a step that has hardly any curvature before it: shorter ones get on
-        short = alpha < SHORT
-        attempt = state.steps // STEPS
-        stiffer = jnp.minimum(STIFFEN * state.stiffness, jnp.asarray(ATTEMPTS)[attempt, 1])
+        short = alpha < jnp.where(state.stiffness < STIFF, SHORTER, SHORT)
+        stiffer = jnp.minimum(STIFFEN * state.stiffness, attempt[1])
         softer = jnp.maximum(state.stiffness / STIFFEN, SOFTEST)
         damped = jnp.clip(DAMP * state.ridge, DAMPING, MOST_DAMPING)
-        good = jnp.all(jnp.isfinite(point.x)) & jnp.all(jnp.isfinite(point.slack))
+        good = jnp.all(jnp.isfinite(point.x))
         after = _State(
             point=point,
             prices=jax.tree.map(lambda new, old: jnp.where(settled, new, old), prices, state.prices),
@@ -294,7 +293,7 @@ def refine(problem: Prepared, start: WarmStart) -> QpSolution:
         # a matrix that rounding left indefinite is tried again with more on its diagonal
         again = state._replace(ridge=1e2 * state.ridge, steps=state.steps + 1)
         after = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, again)
-        anew = (after.steps % STEPS == 0) & ~after.done & (attempt + 1 < len(ATTEMPTS))
+        anew = (after.steps % STEPS == 0) & unfinished(after)
         softness = jnp.asarray(ATTEMPTS)[after.steps // STEPS, 0]
         fresh = nothing._replace(steps=after.steps, stiffness=softness)
         return jax.tree.map(lambda new, old: jnp.where(anew, new, old), fresh, after)
@@ -314,25 +313,16 @@ def _begin(p: Prepared, start: WarmStart) -> _State:
     """The first point and prices of a lane."""
     x = jnp.where(p.free, jnp.clip(start.x, p.lower, p.upper), 0.5 * (p.lower + p.upper))
     t = p.respond(x) + p.instance.offset
-    limit = start.limit_price / p.unit
-    slack = price = jnp.zeros(0)
-    if p.qp.has_limits:
-        sides = jnp.concatenate([p.by_cv(t - p.limit_high), p.by_cv(p.limit_low - t)])
-        spent = p.spent(limit)
-        # where nothing is known of the prices, giving up nothing takes fewer steps
-        slack = jnp.where(spent > 0.0, jnp.maximum(sides.max(axis=1), 0.0) / jnp.tile(p.slack_unit, 2), 0.0)
-        price = jnp.minimum(jnp.tile(p.slack_unit, 2) * spent, p.slack_price)
     prices = _Families(
         row=jnp.where(p.curvature + p.steepness > 0.0, start.row_price / p.unit, 0.0),
         envelope=jnp.where(p.steep > 0.0, start.envelope_price / p.unit, 0.0),
-        limit=limit,
-        slack=price,
+        limit=start.limit_price / p.unit,
         box=p.keep * start.box_price / p.unit,
         hard=jnp.where(p.takes_part, start.hard_price / p.unit, 0.0),
     )
     priced = jnp.any(jnp.concatenate([jnp.ravel(v) for v in prices]) != 0.0)
     return _State(
-        point=_Point(x, slack, t, p.qp.rows.of(x)),
+        point=_Point(x, t, p.qp.rows.of(x)),
         prices=prices,
         stiffness=jnp.where(priced, STIFF, SOFT),
         ridge=jnp.asarray(RIDGE),

@@ -25,6 +25,7 @@ FEASIBLE = 1e-8  # hard rows and limits, in scaled moves
 ACCEPTED = 1e-6  # relative duality gap up to which a solution counts as solved
 RIDGE = 1e-13  # on the diagonal of a Newton matrix, whose entries are of the order of one
 MANY = 16  # active CV limits from which on they are summed by where they change along the horizon
+SINGLE = 1e-9  # of the curvature of a single active CV limit that is left where its price cannot rise
 LEAST_SHARE = 1e-7  # of the solver unit: objectives below it have their gap measured against it
 
 
@@ -66,8 +67,7 @@ class Slopes(NamedTuple):
     Attributes:
         level, sharp: of the predictions, see `gram`.
         limit: of the CV limits per prediction; empty where there are none.
-        upper: which of these are upper limits.
-        slack: of eps, upper limits first.
+        beyond: what their prices were if nothing were given up of them, upper positive.
         move: of every move by itself: limits and envelope.
         hard: of the hard rows.
     """
@@ -75,8 +75,7 @@ class Slopes(NamedTuple):
     level: Float[Array, " prediction"]
     sharp: Float[Array, " prediction"]
     limit: Float[Array, " limit"]
-    upper: Bool[Array, " limit"]
-    slack: Float[Array, " side"]
+    beyond: Float[Array, " limit"]
     move: Float[Array, " n"]
     hard: Float[Array, " hard"]
 
@@ -94,8 +93,7 @@ class Prepared(eqx.Module):
         takes_part: hard rows with free moves; the others are constants.
         row_low, row_high: their limits, infinite for the constants.
         limit_low, limit_high: CV limits that cost something, infinite for the others; empty where there are none at all.
-        slack_unit: what one unit of eps is, per CV [CV unit].
-        slack_price: its price, upper and lower sides; empty where there are no limits.
+        slack_price: price of eps per CV [1/CV unit].
     """
 
     qp: CondensedQp
@@ -114,8 +112,7 @@ class Prepared(eqx.Module):
     row_high: Float[Array, " hard"]
     limit_low: Float[Array, " limit"]
     limit_high: Float[Array, " limit"]
-    slack_unit: Float[Array, " cv"]
-    slack_price: Float[Array, " side"]
+    slack_price: Float[Array, " cv"]
 
     @property
     def keep(self) -> Float[Array, " n"]:
@@ -131,52 +128,40 @@ class Prepared(eqx.Module):
         return (prices @ self.qp.response) * self.qp.scale
 
     def by_cv(self, values: Float[Array, " limit"]) -> Float[Array, "cv horizon"]:
-        """Values per prediction, one row per CV; no columns where there are no limits."""
-        return values.reshape(self.qp.slack_weight.shape[0], -1)
+        """Values per prediction, one row per CV."""
+        return values.reshape(self.slack_price.shape[0], -1)
 
-    def spent(self, limit: Float[Array, " limit"]) -> Float[Array, " side"]:
-        """Sums of the prices of the limits per CV, upper and lower sides."""
-        both = jnp.maximum(jnp.stack([limit, -limit]), 0.0).reshape(2 * self.qp.slack_weight.shape[0], -1)
-        return both @ np.ones(both.shape[1])
-
-    def given_up(self, slack: Float[Array, " side"]) -> tuple[Array, Array]:
-        """Eps per prediction [CV unit], of the upper and of the lower limits; empty where there are none."""
-        if not self.qp.has_limits:
-            return slack, slack
-        horizon = self.limit_high.shape[0] // self.slack_unit.shape[0]
-        high, low = jnp.split(slack, 2)
-        return jnp.repeat(self.slack_unit * high, horizon), jnp.repeat(self.slack_unit * low, horizon)
-
-    def proximal_matrix(self, slopes: Slopes, ridge) -> Float[Array, "m m"]:
-        """Hessian + theta' diag(..) theta + W' diag(hard) W + diag(move) + ridge, identity on fixed moves; with the rows
-        and columns of eps after those of the moves, where there are CV limits.
-        """
+    def proximal_matrix(self, slopes: Slopes, ridge) -> Float[Array, "n n"]:
+        """Hessian + theta' diag(..) theta + W' diag(hard) W + diag(move) + ridge, identity on fixed moves."""
         qp, keep, scale = self.qp, self.keep, self.qp.scale
-        cvs = qp.slack_weight.shape[0]
         level, sharp = slopes.level, slopes.sharp
         if qp.has_limits:
-            many = jnp.sum(slopes.limit > 0.0) > MANY
-            level = level + jnp.where(many, slopes.limit, 0.0)
-            sharp = sharp + jnp.where(many, 0.0, slopes.limit)
-        squares = gram(qp.response, qp.summed, cvs, level, sharp)
+            count = total((slopes.limit > 0.0).astype(scale.dtype))
+            level = level + jnp.where(count > MANY, slopes.limit, 0.0)
+            sharp = sharp + jnp.where(count > MANY, 0.0, slopes.limit)
+        squares = gram(qp.response, qp.summed, qp.slack_weight.shape[0], level, sharp)
+        if qp.has_limits:
+            squares = jax.lax.cond(count > 0.0, lambda: squares - self._common(slopes), lambda: squares)
         matrix = self.hessian + scale[:, None] * scale[None, :] * squares + qp.rows.square(slopes.hard)
-        matrix = matrix * keep[:, None] * keep[None, :] + jnp.diag(keep * slopes.move + (1.0 - keep + ridge))
-        if not qp.has_limits:
-            return matrix
-        nothing = jnp.zeros((2 * cvs, scale.shape[0])), jnp.zeros(2 * cvs)
-        any_ = jnp.any(slopes.limit > 0.0)
-        meet, own = jax.lax.cond(any_, lambda: self._slack_products(slopes), lambda: nothing)
-        return jnp.block([[matrix, meet.T], [meet, jnp.diag(own + slopes.slack + ridge)]])
+        return matrix * keep[:, None] * keep[None, :] + jnp.diag(keep * slopes.move + (1.0 - keep + ridge))
 
-    def _slack_products(self, slopes: Slopes) -> tuple[Float[Array, "side n"], Float[Array, " side"]]:
-        """Products of the active CV limits with their eps: with the moves, and with themselves."""
-        unit, response = jnp.tile(self.slack_unit, 2), self.qp.response
-        limits = self.by_cv(jnp.where(slopes.upper, -slopes.limit, slopes.limit))
-        sides = jnp.concatenate([jnp.minimum(limits, 0.0), jnp.maximum(limits, 0.0)])
-        by_side = sides.reshape(2, *limits.shape)
-        meet = jnp.einsum("scj,cjn->scn", by_side, response.reshape(*limits.shape, -1))
-        meet = meet.reshape(len(unit), -1) * (self.keep * self.qp.scale) * unit[:, None]
-        return meet, jnp.sum(jnp.abs(sides), axis=1) * unit**2
+    def _common(self, slopes: Slopes) -> Float[Array, "n n"]:
+        """What active CV limits have in common whose prices add up to what eps costs, so that only differences count."""
+        cvs = self.qp.slack_weight.shape[0]
+        response = self.qp.response.reshape(cvs, -1, self.qp.scale.shape[0])
+        curvature = jnp.max(self.by_cv(slopes.limit), axis=1)
+        common = jnp.zeros(())
+        for sign in (1.0, -1.0):
+            beyond = self.by_cv(jnp.maximum(sign * slopes.beyond, 0.0))
+            active = ((beyond > 0.0) & (self.by_cv(slopes.limit) > 0.0)).astype(response.dtype)
+            spent = jnp.sum(beyond, axis=1) > self.slack_price
+            # a share short of the whole leaves a single active limit hardly any curvature, but never less than none
+            weight = jnp.where(
+                spent, (1.0 - SINGLE) * curvature / jnp.maximum(jnp.sum(active, axis=1), 1.0), 0.0
+            )
+            summed = jnp.einsum("cj,cjn->cn", active, response)
+            common += summed.T @ (weight[:, None] * summed)
+        return common
 
     def value(self, x, t) -> Float[Array, ""]:
         """Objective in its own unit at x with t = theta x + t0."""
@@ -202,10 +187,9 @@ def prepare(
     if qp.has_limits:
         unit = jnp.maximum(unit, 1e-3 * jnp.max(qp.slack_weight * qp.reach))
     unit = jnp.where(unit > 0.0, unit, 1.0)
-    none, slack_unit = jnp.zeros(0), jnp.where(qp.reach > 0.0, qp.reach, 1.0)
+    none = jnp.zeros(0)
     horizon = instance.limit_high.shape[0] // qp.slack_weight.shape[0]
     paid = jnp.repeat(qp.slack_weight > 0.0, horizon)
-    price = qp.slack_weight * slack_unit / unit
     free = (upper - lower) > FIXED
     # rows without free moves are constants and leave the solver; feasibility of the whole is checked outside
     takes_part = qp.rows.touch(free.astype(lower.dtype))
@@ -226,8 +210,7 @@ def prepare(
         row_high=jnp.where(takes_part, instance.row_high, jnp.inf),
         limit_low=jnp.where(paid, instance.limit_low, -jnp.inf) if qp.has_limits else none,
         limit_high=jnp.where(paid, instance.limit_high, jnp.inf) if qp.has_limits else none,
-        slack_unit=slack_unit,
-        slack_price=jnp.concatenate([price, price]) if qp.has_limits else none,
+        slack_price=qp.slack_weight / unit,
     )
 
 

@@ -25,6 +25,7 @@ COSTS = (
     "heavy_soft_linear",
     "light_move_weight",
     "no_move_weight",
+    "costly_slack",
 )
 _residuals = jax.jit(kkt_residuals)
 
@@ -71,24 +72,6 @@ def test_small_problems_with_active_limits_are_all_solved(shape, cost):
             problems.TWISTS[cost](body, rng)
         active += assert_solved(pose_case(body, size=SIZE))
     assert active >= 6
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_problems_whose_slack_is_a_thousand_times_as_costly_are_solved_or_say_that_they_are_not(shape):
-    """One in a hundred is known to end with a gap that is not closed. What counts is that it is never called closed."""
-    solved = []
-    for seed in range(12):
-        rng = np.random.default_rng(seed + 7)
-        body = problems.small_case(rng, **SHAPES[shape])
-        for twist in (LIMITS[seed % 3], "costly_slack"):
-            problems.TWISTS[twist](body, rng)
-        posed = pose_case(body, size=SIZE)
-        solution = solve_one(posed.qp, posed.instance)
-        solved.append(int(solution.status) == status.OPTIMAL)
-        assert solved[-1] == (float(solution.residual) <= 1e-6)
-        if solved[-1]:
-            assert_solved(posed)
-    assert sum(solved) >= 9
 
 
 @pytest.mark.parametrize("shape", SHAPES)
