@@ -137,7 +137,7 @@ class _Proximal(NamedTuple):
         limit = p.limit_high  # none
         if p.qp.has_limits:
             # a limit that costs much has far to go with its price
-            reach = jnp.maximum(p.qp.reach, TINY)
+            reach = jnp.where(p.qp.reach > 0.0, p.qp.reach, 1.0)
             urgent = steeper * stiffness * p.slack_price * reach
             urgent = jnp.clip(urgent, stiffness, jnp.maximum(stiffness, STIFF))
             # the same along the horizon, so that limits that are active side by side are summed at once
