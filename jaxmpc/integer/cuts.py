@@ -35,8 +35,8 @@ def cut_of(constants: Constants, result: Relaxations, lane: int, lower, upper):
     value = result.bound[lane] - np.minimum(gradient * (lower - at), gradient * (upper - at)).sum()
     price = result.envelope[lane][:, c.integer]
     value -= (price * at - c.knot * np.abs(price)).sum()
-    gradient = gradient - price.sum(axis=0)
-    return float(value), at, gradient
+    more, bend = c.of_chords(result.position[lane], at)
+    return float(value + more), at, gradient - price.sum(axis=0) + bend
 
 
 class Cuts:

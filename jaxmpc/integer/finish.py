@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,6 +23,7 @@ from jaxmpc.integer.tables import Constants
 from jaxmpc.problem.instance import QpInstance
 from jaxmpc.problem.memory import check_ranges
 from jaxmpc.programs.clock import Clock
+from jaxmpc.status import LIMIT
 
 WIDEST_ENVELOPE = 4  # steps up to which the envelope of the squared integer move is built
 
@@ -70,16 +72,30 @@ def finish_steps(
         own = relaxer.scenario(i)
         wanted = moves.T.reshape(-1)[own.integer] / own.scales[own.integer]
         starts.append([np.clip(np.nan_to_num(wanted), -1e6, 1e6)])
-    return solve_integers(
-        relaxer,
-        instances,
-        root,
-        starts=starts,
-        gap=gap,
-        time_limit=time_limit,
-        finish=finish,
-        spent=spent + clock.seconds / len(starts),
-    )
+    rest: dict[str, Any] = dict(gap=gap, time_limit=time_limit, finish=finish)
+    spent += clock.seconds / len(starts)
+    found = solve_integers(relaxer, instances, root, starts=starts, last=False, spent=spent, **rest)
+    for i, result in enumerate(found):
+        late = time_limit is not None and result.seconds >= time_limit
+        if result.status == LIMIT and not late and relaxer.scenario(i).chord_weight.any():
+            found[i] = _tightened(relaxer, instances, i, result, starts[i], rest)
+    return found
+
+
+def _tightened(
+    relaxer: Relaxer, instances: QpInstance, index: int, found: SearchResult, starts: list[np.ndarray], rest
+) -> SearchResult:
+    """The search of one scenario that is still open, on its tighter relaxation."""
+    clock, own = Clock(), relaxer.with_chords(index)
+    one = jax.tree.map(lambda leaf: leaf[index : index + 1], instances)
+    root = own.solve_roots(one, own.cold(one))
+    if found.x is not None:
+        starts = [*starts, whole(found.x[own.scenario(0).integer])]
+    (result,) = solve_integers(own, one, root, starts=[starts], spent=found.seconds + clock.seconds, **rest)
+    result.nodes, result.root = result.nodes + found.nodes, found.root
+    if result.bound < found.bound <= result.value:
+        result.bound = found.bound
+    return result
 
 
 def _bounded(relaxer_of, instances: QpInstance) -> tuple[np.ndarray, np.ndarray]:

@@ -164,8 +164,16 @@ class Search:
         for steep, knot, price in zip(c.slope, c.knot, result.envelope[lane][:, c.integer], strict=True):
             own = steep[:, None] * np.maximum(np.abs(values) - knot, 0.0)
             excess += own - price[:, None] * values + (knot * np.abs(price))[:, None]
-        excess = np.where(values <= upper[:, None], np.maximum(excess, 0.0), np.inf)
         value = float(result.bound[lane])
+        if len(result.position[lane]):  # complete the square: the same bound about another center
+            more, bend = c.of_chords(result.position[lane], center)
+            step = c.inverse @ bend
+            rest = bend - c.schur @ step  # next to nothing
+            least = np.minimum(rest * (lower - center), rest * (upper - center))
+            excess += rest[:, None] * (values - center[:, None]) - least[:, None]
+            value += more + least.sum() - 0.5 * (2.0 * bend - c.schur @ step) @ step
+            center = center - step
+        excess = np.where(values <= upper[:, None], np.maximum(excess, 0.0), np.inf)
         return LowerModel(value, center, lower, upper, excess, c.schur, c.radius, c.order, c.leading)
 
     # ---- incumbents

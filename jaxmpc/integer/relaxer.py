@@ -16,8 +16,9 @@ import numpy as np
 
 from jaxmpc.integer.search import Relaxed, relax
 from jaxmpc.integer.tables import Constants
+from jaxmpc.problem.condense import CondensedQp
 from jaxmpc.problem.instance import QpInstance
-from jaxmpc.programs.lanes import Lanes
+from jaxmpc.programs.lanes import Lanes, lanes_of
 from jaxmpc.relaxed.newton import WarmStart
 from jaxmpc.relaxed.solve import cold_start
 
@@ -60,6 +61,11 @@ class Relaxations:
         """Prices of the envelope, ``"batch level n"``."""
         return self.warm.envelope_price  # pyright: ignore[reportReturnType]
 
+    @property
+    def position(self) -> np.ndarray:
+        """Prices of the chords of squared positions, ``"batch position"``; empty where there are none."""
+        return self.warm.position_price  # pyright: ignore[reportReturnType]
+
     def start(self, lane: int) -> WarmStart:
         """Moves and prices of one lane."""
         return jax.tree.map(lambda leaf: leaf[lane], self.warm)
@@ -101,6 +107,20 @@ class Relaxer:
             return self
         return Relaxer(self.qps.take(index), [self.constants[i] for i in index])
 
+    def with_chords(self, index: int) -> Relaxer:
+        """The relaxations of one scenario whose positions pay along chords what they can (`tighten`)."""
+        constants, qp = self.scenario(index), self.problem(index)
+        weight = np.zeros(constants.size.mvs * constants.size.rows)
+        weight[constants.position] = constants.chord_weight
+        values = qp.hessian - qp.rows.square(jnp.asarray(2.0 * weight)), jnp.asarray(weight)
+        fields = lambda qp: (qp.hessian, qp.position_weight)  # noqa: E731
+        tight = eqx.tree_at(fields, qp, values, is_leaf=lambda leaf: leaf is None)
+        return Relaxer(lanes_of([tight]), [constants])
+
+    def problem(self, index: int) -> CondensedQp:
+        """Constant part of a scenario's problems."""
+        return self.qps.lane(index) if self.qps.count else self.qps.shared
+
     def scenario(self, index: int) -> Constants:
         """Constants of a scenario."""
         return self.constants[0 if len(self.constants) == 1 else index]
@@ -136,7 +156,7 @@ class Relaxer:
         """Starts that know nothing, one per scenario."""
         count = len(instances.lower)
         one = jax.tree.map(lambda leaf: np.asarray(leaf)[0], instances)
-        start = jax.tree.map(np.asarray, cold_start(self.constants[0].qp, one))
+        start = jax.tree.map(np.asarray, cold_start(self.problem(0), one))
         return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape)), start)
 
     def solve_roots(self, instances: QpInstance, warm: WarmStart) -> Relaxations:

@@ -46,6 +46,7 @@ def solve_integers(
     gap: float = 1e-6,
     time_limit: float | None = None,
     finish: str = "auto",
+    last: bool = True,
     spent: float = 0.0,
 ) -> list[SearchResult]:
     """Search the problems of many scenarios side by side on the host.
@@ -58,6 +59,7 @@ def solve_integers(
         gap: relative gap at which a solve stops.
         time_limit: seconds of work per scenario; the best plan so far is returned with its true gap.
         finish: ``auto``, or the one path that has to close the problems after fixing.
+        last: whether to go on where lists are too long and chords would tighten the relaxation.
         spent: seconds that every scenario has taken already.
 
     Returns:
@@ -73,7 +75,7 @@ def solve_integers(
         own = jax.tree.map(lambda leaf, i=i: leaf[i], instances)
         search = Search(relaxer.scenario(i), own, root.part(i, i + 1), gap, time_limit)
         search.spent = spent
-        searches.append((i, search, _line(search, starts[i], finish)))
+        searches.append((i, search, _line(search, starts[i], finish, last)))
     done = run(relaxer, instances, searches)
     for (i, search, _), result in zip(searches, done, strict=True):
         result.seconds = search.spent
@@ -92,7 +94,7 @@ def _closed_by_root(
     return SearchResult(x, value, min(bound, value), OPTIMAL, "relaxation", 1, root.start(lane), seconds)
 
 
-def _line(search: Search, starts: Sequence[np.ndarray], finish: str) -> Steps:
+def _line(search: Search, starts: Sequence[np.ndarray], finish: str, last: bool) -> Steps:
     """The whole line of one solve, from its relaxation on; returns `SearchResult`."""
     c, root, root_bound = search.constants, search.root, search.root_bound
     integer = c.integer
@@ -141,6 +143,8 @@ def _line(search: Search, starts: Sequence[np.ndarray], finish: str) -> Steps:
             done = yield from enumerate_all(search, model, cuts, lower, upper, limited=limited)
         if done or finish == "enumeration" or search.out_of_time():
             return search.finish("enumeration" if done else None, np.inf if done else root_bound)
+    if not last and c.chord_weight.any():
+        return search.finish(None, root_bound)
     if finish in ("auto", "highs"):
         seconds = search.seconds_left()
         if finish == "auto":

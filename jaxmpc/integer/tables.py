@@ -5,6 +5,7 @@ The host reads `Constants`, the compiled search the arrays of `Tables`, padded t
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -13,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxmpc.errors import InputError
 from jaxmpc.integer.lower_bound import assignment_order, leading_factor, root_factor, schur_complement
+from jaxmpc.integer.tighten import chord_weights
 from jaxmpc.problem.blocking import coupled_blocks, moves_per_block
 from jaxmpc.problem.condense import CondensedQp
 from jaxmpc.problem.layout import Size
@@ -93,6 +95,40 @@ class Constants:
         self.knot = np.arange(len(self.slope), dtype=float)[:, None]
         self.scale = max(float(np.diag(curvature).max()), 1e-12)
         self.own_weight = 0.5 * (np.diag(curvature) - np.diag(hessian))[self.integer]
+        # hard rows of the positions of the integer MVs, and these positions as sums of the whole moves
+        self.position = np.concatenate(
+            [mv * size.rows + blocks for mv in structure.integer_mvs] or [blocks[:0]]
+        )
+        chain = np.tri(len(blocks)) * moves_per_block(structure)
+        self.reached = np.kron(np.eye(len(structure.integer_mvs)), chain)
+
+    @functools.cached_property
+    def chord_weight(self) -> Float[np.ndarray, " position"]:
+        """Curvature of the positions that chords may pay (`tighten`), made when first needed."""
+        back = np.linalg.inv(self.reached)
+        return chord_weights(back.T @ self.schur @ back)
+
+    def of_chords(self, price: np.ndarray, at: np.ndarray) -> tuple[float, np.ndarray]:
+        """What prices of chords add to a lower bound with all curvature: its value and its gradient at moves.
+
+        D w^2 is at least price w less the largest of price k - D k^2 over whole k; about w0 it is
+        D w0^2 + 2 D w0 (w - w0) and the curvature that `schur` has.
+
+        Args:
+            price: of the chords, per hard row; empty where there are none.
+            at: moves of the integer MVs [steps].
+        """
+        if not len(price):
+            return 0.0, np.zeros(len(at))
+        weight, own, w = self.chord_weight, price[self.position], self.reached @ at
+        k = np.round(own / np.where(weight > 0.0, 2.0 * weight, 1.0)) * (weight > 0.0)
+        value = (weight * w**2 - own * w + own * k - weight * k**2).sum()
+        return float(value), self.reached.T @ (2.0 * weight * w - own)
+
+    @functools.cached_property
+    def inverse(self) -> np.ndarray:
+        """Of `schur`, on the directions that have curvature."""
+        return np.linalg.pinv(self.schur, hermitian=True)
 
     def tables(self, integers: int) -> Tables:
         """For the compiled search, with room for so many integer moves."""

@@ -109,6 +109,8 @@ class CondensedQp(eqx.Module):
         bend: curvature of every move outside all deadzones.
         reach: what one unit of one move can do to a CV at most.
         whole: moves of integer MVs.
+        position_weight: curvature of the tracking cost that whole positions pay along the chords of their square, per hard
+            row and without them in `hessian` (`integer.tighten`); None where there is none.
         has_limits: whether any CV limit is finite (static; without, their rows are left out).
     """
 
@@ -130,6 +132,7 @@ class CondensedQp(eqx.Module):
     bend: Float[Array, " n"]
     reach: Float[Array, " cv"]
     whole: Bool[Array, " n"]
+    position_weight: Float[Array, " hard"] | None
     has_limits: bool = eqx.field(static=True)
 
     @property
@@ -268,6 +271,7 @@ def condense(
         bend=2.0 * soft * scale**2,
         reach=jnp.max(matrices.largest * scale, axis=1),
         whole=whole,
+        position_weight=None,
         has_limits=has_limits,
     )
 

@@ -19,7 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxmpc.relaxed.problem import (
     RIDGE,
@@ -63,6 +63,7 @@ class WarmStart(eqx.Module):
         x: moves.
         row_price: prices of the deadzones.
         envelope_price: prices of the envelope.
+        position_price: prices of the chords of squared positions; empty where there are none.
         limit_price: prices of the CV limits, upper positive; empty where there are none.
         box_price: prices of the limits of x, upper positive.
         hard_price: prices of the hard rows, upper positive.
@@ -71,6 +72,7 @@ class WarmStart(eqx.Module):
     x: Float[Array, " n"]
     row_price: Float[Array, " prediction"]
     envelope_price: Float[Array, "level n"]
+    position_price: Float[Array, " position"]
     limit_price: Float[Array, " limit"]
     box_price: Float[Array, " n"]
     hard_price: Float[Array, " hard"]
@@ -82,6 +84,7 @@ def warm_start_of(solution: QpSolution) -> WarmStart:
         x=solution.x,
         row_price=solution.row_price,
         envelope_price=solution.envelope_price,
+        position_price=solution.position_price,
         limit_price=solution.limit_price,
         box_price=solution.upper_price - solution.lower_price,
         hard_price=solution.row_high_price - solution.row_low_price,
@@ -89,10 +92,11 @@ def warm_start_of(solution: QpSolution) -> WarmStart:
 
 
 class _Families(NamedTuple):
-    """Values per deadzone, level of the envelope, CV limit (upper positive), limit of x and hard row."""
+    """Values per deadzone, level of the envelope, chord, CV limit (upper positive), limit of x and hard row."""
 
     row: Array
     envelope: Array
+    position: Array
     limit: Array
     box: Array
     hard: Array
@@ -142,7 +146,7 @@ class _Proximal(NamedTuple):
             urgent = jnp.clip(urgent, stiffness, jnp.maximum(stiffness, STIFF))
             # the same along the horizon, so that limits that are active side by side are summed at once
             limit = jnp.repeat(urgent / reach**2, p.limit_high.shape[0] // reach.shape[0])
-        sigma = _Families(row, stiffness, limit, stiffness, hard)
+        sigma = _Families(row, stiffness, hard[: p.position.shape[0]], limit, stiffness, hard)
         return cls(p, sigma, p.curvature / (p.curvature + row))
 
     def prices(self, point: _Point, old: _Families) -> _Families:
@@ -153,10 +157,23 @@ class _Proximal(NamedTuple):
         return _Families(
             row=self.share * excess + (1.0 - self.share) * jnp.clip(excess, -p.steepness, p.steepness),
             envelope=jnp.clip(own, -p.steep, p.steep),
+            position=self._chords(point, old)[0] if chorded(p) else old.position,
             limit=self._limits(point, old) if p.qp.has_limits else old.limit,
             box=_away(sigma.box, point.x, old.box, p.lower, p.upper),
             hard=_away(sigma.hard, point.w, old.hard, p.row_low, p.row_high),
         )
+
+    def _chords(self, point: _Point, old: _Families) -> tuple[Float[Array, " hard"], Bool[Array, " hard"]]:
+        """Prices of the chords of D w^2, and whether a position is held at a whole number.
+
+        With z = sigma w + price it is held at k where z is within D of k (sigma + 2 D), and between k and k + 1 the price is the
+        slope D (2 k + 1) of the chord.
+        """
+        weight, sigma = self.problem.position, self.sigma.position
+        z = sigma * point.w + old.position
+        k = jnp.floor((z + weight) / (sigma + 2.0 * weight))
+        at = z - k * (sigma + 2.0 * weight) <= weight
+        return jnp.where(at, z - sigma * k, weight * (2.0 * k + 1.0)), at & (weight > 0.0)
 
     def _limits(self, point: _Point, old: _Families) -> Float[Array, " limit"]:
         """Prices of the CV limits: what sigma t + price exceeds sigma (limit + eps) by, with the best eps."""
@@ -193,13 +210,16 @@ class _Proximal(NamedTuple):
         own = jnp.abs(self._beyond(point, old))
         bend = jnp.sum(jnp.where((own > 0.0) & (own <= p.steep), sigma.envelope, 0.0), axis=0)
         active = lambda prices, curvature: jnp.where(prices != 0.0, curvature, 0.0)  # noqa: E731
+        hard = active(new.hard, sigma.hard)
+        if chorded(p):
+            hard += jnp.where(self._chords(point, old)[1], sigma.position, 0.0)
         return Slopes(
             level=jnp.where(excess > 0.0, sigma.row * self.share, 0.0),
             sharp=jnp.where(at_edge, sigma.row * (1.0 - self.share), 0.0),
             limit=active(new.limit, sigma.limit),
             beyond=self._outside(point, old) if p.qp.has_limits else new.limit,
             move=active(new.box, sigma.box) + bend,
-            hard=active(new.hard, sigma.hard),
+            hard=hard,
         )
 
     def _excess(self, point: _Point, old: _Families):
@@ -215,12 +235,21 @@ class _Proximal(NamedTuple):
         """Gradient of the augmented Lagrangian, given the new prices at x."""
         p = self.problem
         force = p.hessian @ x + p.linear + p.pull(self.net(prices))
-        force += prices.box + jnp.sum(prices.envelope, axis=0) + p.qp.rows.pull(prices.hard)
+        force += prices.box + jnp.sum(prices.envelope, axis=0) + p.qp.rows.pull(self.pushed(prices))
         return p.keep * force
+
+    def pushed(self, prices: _Families) -> Float[Array, " hard"]:
+        """Prices of the hard rows."""
+        return prices.hard + prices.position if chorded(self.problem) else prices.hard
 
     def net(self, prices: _Families) -> Float[Array, " prediction"]:
         """Prices of the predictions."""
         return prices.row + prices.limit if self.problem.qp.has_limits else prices.row
+
+
+def chorded(problem: Prepared) -> bool:
+    """Whether squared positions are replaced by their chords."""
+    return problem.qp.position_weight is not None
 
 
 def _away(sigma, value, price, low, high):
@@ -259,7 +288,12 @@ def refine(problem: Prepared, start: WarmStart) -> QpSolution:
 
         def along(alpha):  # derivative of the merit along the direction, increasing in alpha
             new = proximal.prices(moved(point, direction, alpha), state.prices)
-            change = slope + alpha * bend + total(proximal.net(new) * direction.t) + new.hard @ direction.w
+            change = (
+                slope
+                + alpha * bend
+                + total(proximal.net(new) * direction.t)
+                + proximal.pushed(new) @ direction.w
+            )
             return change + (new.box + jnp.sum(new.envelope, axis=0)) @ dx
 
         alpha = _search(along, gradient @ way)
@@ -305,7 +339,7 @@ def refine(problem: Prepared, start: WarmStart) -> QpSolution:
     state = jax.lax.while_loop(unfinished, step, _begin(p, start))
     x = jnp.clip(state.point.x, p.lower, p.upper)
     found = jax.tree.map(lambda prices: unit * prices, state.prices)
-    prices = Prices(found.row, found.envelope, found.limit, found.hard)
+    prices = Prices(found.row, found.envelope, found.position, found.limit, found.hard)
     return conclude(p, x, prices, state.steps)
 
 
@@ -316,6 +350,7 @@ def _begin(p: Prepared, start: WarmStart) -> _State:
     prices = _Families(
         row=jnp.where(p.curvature + p.steepness > 0.0, start.row_price / p.unit, 0.0),
         envelope=jnp.where(p.steep > 0.0, start.envelope_price / p.unit, 0.0),
+        position=start.position_price / p.unit,
         limit=start.limit_price / p.unit,
         box=p.keep * start.box_price / p.unit,
         hard=jnp.where(p.takes_part, start.hard_price / p.unit, 0.0),

@@ -40,6 +40,7 @@ class QpSolution(eqx.Module):
         iterations: Newton steps.
         row_price: multiplier of every prediction's deadzone cost (subgradient in t).
         envelope_price: the same for the levels of the envelope, in x.
+        position_price: the same for the chords of squared positions; empty where there are none.
         limit_price: net price of the CV limits per prediction (high minus low); empty where there are none.
         lower_price, upper_price: multipliers of the limits of x, non-negative.
         row_low_price, row_high_price: multipliers of the hard rows, non-negative.
@@ -53,6 +54,7 @@ class QpSolution(eqx.Module):
     iterations: Int[Array, ""]
     row_price: Float[Array, " prediction"]
     envelope_price: Float[Array, "level n"]
+    position_price: Float[Array, " position"]
     limit_price: Float[Array, " limit"]
     lower_price: Float[Array, " n"]
     upper_price: Float[Array, " n"]
@@ -89,6 +91,7 @@ class Prepared(eqx.Module):
         hessian, linear: smooth part of the objective.
         curvature, steepness: 2 S and s per prediction.
         steep: slopes of the envelope.
+        position: curvature whose place chords take, per hard row; empty where there are none.
         free: moves with room between their limits.
         takes_part: hard rows with free moves; the others are constants.
         row_low, row_high: their limits, infinite for the constants.
@@ -106,6 +109,7 @@ class Prepared(eqx.Module):
     curvature: Float[Array, " prediction"]
     steepness: Float[Array, " prediction"]
     steep: Float[Array, "level n"]
+    position: Float[Array, " position"]
     free: Bool[Array, " n"]
     takes_part: Bool[Array, " hard"]
     row_low: Float[Array, " hard"]
@@ -204,6 +208,7 @@ def prepare(
         curvature=2.0 * qp.soft_quadratic / unit,
         steepness=qp.soft_linear / unit,
         steep=qp.steep / unit,
+        position=none if qp.position_weight is None else qp.position_weight / unit,
         free=free,
         takes_part=takes_part,
         row_low=jnp.where(takes_part, instance.row_low, -jnp.inf),
@@ -237,6 +242,9 @@ def evaluate(qp: CondensedQp, instance: QpInstance, x: Float[Array, " n"]) -> Fl
 
 def _value(qp: CondensedQp, instance: QpInstance, x, t) -> Float[Array, ""]:
     own = jnp.sum(qp.move_weight * x**2) + jnp.sum(_envelope_cost(qp, x))
+    if qp.position_weight is not None:
+        w = qp.rows.of(x)
+        own += qp.position_weight @ (chords(w) - w**2)
     return total(qp.quadratic * t**2 + _soft_cost(qp, t)) + own + jnp.sum(limit_cost(qp, instance, t))
 
 
@@ -252,6 +260,12 @@ def _soft_cost(qp: CondensedQp, t):
 
 def _envelope_cost(qp: CondensedQp, x):
     return qp.steep * jnp.maximum(jnp.abs(x) - qp.knot, 0.0)
+
+
+def chords(w: Float[Array, " hard"]) -> Float[Array, " hard"]:
+    """The square at whole numbers, straight lines between them."""
+    k = jnp.floor(w)
+    return k**2 + (2.0 * k + 1.0) * (w - k)
 
 
 def limit_cost(qp: CondensedQp, instance: QpInstance, t):
@@ -270,6 +284,7 @@ class Prices(eqx.Module):
 
     row: Float[Array, " prediction"]
     envelope: Float[Array, "level n"]
+    position: Float[Array, " position"]
     limit: Float[Array, " limit"]
     hard: Float[Array, " hard"]
 
@@ -307,12 +322,16 @@ def conclude(
         limit_price, paid = _limit_terms(qp, instance, t, prices.limit)
         found += jnp.sum(limit_cost(qp, instance, t)) - paid
         net = price + limit_price
-    wx = qp.rows.of(x)
+    wx, pushed = qp.rows.of(x), prices.hard
+    if qp.position_weight is not None:
+        weight, position = qp.position_weight, prices.position
+        found += total(weight * chords(wx) + chord_conjugate(weight, position) - position * wx)
+        pushed = pushed + position
     row_low, row_high = jnp.maximum(-prices.hard, 0.0), jnp.maximum(prices.hard, 0.0)
     found -= jnp.sum(jnp.where(row_high > 0, row_high * (wx - instance.row_high), 0.0))
     found -= jnp.sum(jnp.where(row_low > 0, row_low * (instance.row_low - wx), 0.0))
     gradient = qp.hessian @ x + problem.linear * problem.unit + problem.pull(net)
-    gradient += jnp.sum(envelope, axis=0) + qp.rows.pull(prices.hard)
+    gradient += jnp.sum(envelope, axis=0) + qp.rows.pull(pushed)
     # the box of x is not priced but kept: min over the box of gradient'(z - x), curvature left out
     lower, upper = problem.lower, problem.upper
     reach_low = jnp.where(jnp.isfinite(lower), lower, x - 10.0 * (1.0 + jnp.abs(x)))
@@ -331,6 +350,7 @@ def conclude(
         iterations=iterations,
         row_price=price,
         envelope_price=envelope,
+        position_price=prices.position,
         limit_price=limit_price,
         lower_price=jnp.maximum(gradient, 0.0),
         upper_price=jnp.maximum(-gradient, 0.0),
@@ -338,6 +358,13 @@ def conclude(
         row_high_price=row_high,
         residual=jnp.maximum(relative, broken),
     )
+
+
+def chord_conjugate(weight: Float[Array, " hard"], price: Float[Array, " hard"]) -> Float[Array, " hard"]:
+    """The largest of price k - weight k^2 over whole numbers k."""
+    some = weight > 0.0
+    k = jnp.where(some, jnp.round(price / jnp.where(some, 2.0 * weight, 1.0)), 0.0)
+    return price * k - weight * k**2
 
 
 def _limit_terms(qp: CondensedQp, instance: QpInstance, t, price):

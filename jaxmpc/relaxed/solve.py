@@ -48,10 +48,9 @@ def solve_lane(qp: CondensedQp, instance: QpInstance, lower, upper, start: WarmS
 def cold_start(qp: CondensedQp, instance: QpInstance) -> WarmStart:
     """A start that knows nothing: no moves, no prices."""
     none = jnp.zeros_like
-    x = none(instance.lower)
-    return WarmStart(
-        x, none(instance.offset), none(qp.steep), none(instance.limit_high), x, none(instance.row_low)
-    )
+    x, hard = none(instance.lower), none(instance.row_low)
+    position = hard[: 0 if qp.position_weight is None else hard.shape[0]]
+    return WarmStart(x, none(instance.offset), none(qp.steep), position, none(instance.limit_high), x, hard)
 
 
 def shifted_start(start: WarmStart, cvs: int) -> WarmStart:
