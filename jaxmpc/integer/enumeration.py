@@ -16,6 +16,7 @@ from jaxmpc.integer.lower_bound import LowerModel, enumerate_below
 MOST = 20_000  # partial candidates alive at once from which the list is given up
 CELLS = 600_000  # the same in single moves, for long horizons
 FIRST, MOST_AT_ONCE = 2, 64  # candidates solved in the first round; later ones take twice as many
+PATIENCE = 7  # rounds of a limited list, whose cuts do not prune much if more are needed
 
 
 def enumerate_all(
@@ -35,7 +36,7 @@ def enumerate_all(
         cuts: known so far; more are added.
         lower: limits of the integer moves, within the model's.
         upper: the same.
-        limited: give up where the list grows beyond `MOST`.
+        limited: give up where the list grows beyond `MOST`, or is not done after `PATIENCE` rounds.
     """
     most = max(min(MOST, CELLS // max(len(lower), 1)), 1) if limited else None
     found = enumerate_below(model, search.chains, lower, upper, search.cutoff, most)
@@ -57,6 +58,8 @@ def enumerate_all(
             return True
         if search.out_of_time():
             search.discard(float(bounds.min()))
+            return False
+        if limited and rounds == PATIENCE:
             return False
         size = min(FIRST * 2**rounds, MOST_AT_ONCE)
         rank = np.argsort(bounds, kind="stable")

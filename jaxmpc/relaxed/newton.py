@@ -54,6 +54,10 @@ SETTLED, EXACT = 1e-7, 1e-12  # share of the gradient without moves left when pr
 ROUNDED, STALLED = 1e-11, 0.3  # share that rounding may be, and what a step then leaves of what there was
 # at the end, the last change of the prices, squared, and what it leaves hard rows violated by
 UNPAID, OUTSIDE = 1e-14, 1e-9
+OWED, KEPT = (
+    1e-13,
+    0.9,
+)  # duality gap that a change of the prices is worth at the end, unless a step leaves so much of it
 
 
 class WarmStart(eqx.Module):
@@ -118,6 +122,7 @@ class _State(NamedTuple):
     steps: Array
     done: Array
     left: Array
+    owed: Array
 
 
 class _Proximal(NamedTuple):
@@ -305,6 +310,8 @@ def refine(problem: Prepared, start: WarmStart) -> QpSolution:
         settled, exact = left < SETTLED * (1.0 + largest), left < EXACT * at_play
         gained = jax.tree.map(lambda new, old: new - old, prices, state.prices)
         change = sum(jnp.sum(g**2 / sigma) for g, sigma in zip(gained, proximal.sigma, strict=True))
+        worth = jax.tree.map(lambda gain, new: jnp.abs(gain * new), gained, prices)
+        owed = sum(jnp.sum(w / sigma) for w, sigma in zip(worth, proximal.sigma, strict=True))
         outside = jnp.max(jnp.abs(gained.hard) / proximal.sigma.hard, initial=0.0)
         # a kink close by stops a step that has hardly any curvature before it: shorter ones get on
         short = alpha < jnp.where(state.stiffness < STIFF, SHORTER, SHORT)
@@ -321,8 +328,10 @@ def refine(problem: Prepared, start: WarmStart) -> QpSolution:
             # rounding may keep more of the gradient than asked for: then one step leaves as much as the one before
             done=(exact | (left < ROUNDED * (1.0 + largest)) & (left > STALLED * state.left))
             & (change < UNPAID)
+            & ((owed < OWED) | (owed > KEPT * state.owed))
             & (outside < OUTSIDE),
             left=left,
+            owed=owed,
         )
         # a matrix that rounding left indefinite is tried again with more on its diagonal
         again = state._replace(ridge=1e2 * state.ridge, steps=state.steps + 1)
@@ -364,6 +373,7 @@ def _begin(p: Prepared, start: WarmStart) -> _State:
         steps=jnp.zeros((), dtype=jnp.int32),
         done=jnp.asarray(False),
         left=jnp.asarray(jnp.inf),
+        owed=jnp.asarray(jnp.inf),
     )
 
 
