@@ -16,7 +16,7 @@ import itertools
 import numpy as np
 
 from jaxmpc.integer.cuts import Cuts
-from jaxmpc.integer.feasible import MoveLimits, position_limits, satisfied, tighten, within
+from jaxmpc.integer.feasible import MoveLimits, needed, position_limits, satisfied, tighten, within
 from jaxmpc.integer.host_search import Search, Steps
 from jaxmpc.integer.lower_bound import LowerModel, PositionPrices, enumerate_below, exclude, radii
 from jaxmpc.integer.relaxer import LANES, Relaxations
@@ -54,6 +54,15 @@ class _Node:
         return self.model.excess.size + sum(np.size(part) for part in prices)
 
 
+@dataclasses.dataclass
+class _Child:
+    """What may become a node; `solved` are its relaxation's batch and lane, None where no whole moves are left."""
+
+    limits: MoveLimits
+    start: WarmStart
+    solved: tuple[Relaxations, int] | None = None
+
+
 @dataclasses.dataclass(frozen=True)
 class _Branching:
     """Two children: entry `row` (a move, or from `count` on a position) at most `cut`, or more; estimates of their gains."""
@@ -72,7 +81,7 @@ def branch_and_bound(
     """
     tree = _Tree(search, cuts)
     limits = MoveLimits(lower, upper, *position_limits(search.chains))
-    tree.push(root_bound, limits, tree.priced(model, root, 0, limits), root.start(0))
+    tree.keep(_Node(root_bound, limits, tree.priced(model, root, 0, limits), root.start(0)))
     while True:
         least = tree.least
         if least >= search.cutoff:
@@ -109,11 +118,8 @@ class _Tree:
         followed = np.inf if self.next is None else self.next.bound
         return min(followed, self.heap[0][0] if self.heap else np.inf)
 
-    def push(self, bound: float, limits: MoveLimits, model: LowerModel, start: WarmStart) -> None:
-        """Keep a node open."""
-        self._keep(_Node(bound, limits, model, start))
-
-    def _keep(self, node: _Node) -> None:
+    def keep(self, node: _Node) -> None:
+        """Leave a node open."""
         heapq.heappush(self.heap, (node.bound, next(self.number), node))
         self.held += node.size
 
@@ -128,8 +134,8 @@ class _Tree:
     # ---- one round
     def step(self) -> Steps:
         """Branch the followed node, and as many of least bound as fill a batch; keeps their children."""
-        search, plans, lanes = self.search, [], []
-        while len(lanes) < LANES and (node := self._take()) is not None:
+        search, plans, children = self.search, [], []
+        while len(children) < LANES and (node := self._take()) is not None:
             if node.bound >= search.cutoff:
                 search.discard(node.bound)
                 continue
@@ -138,41 +144,38 @@ class _Tree:
                 continue
             if (yield from self._listed(reduced)):
                 continue
-            branchings = self._branchings(reduced)
-            plan, first = [], len(lanes)
-            for branching in branchings[: max((LANES - first) // 2, 1)]:
-                plan.append((branching, len(lanes)))
-                lanes += [(limits, reduced.start) for limits in self._sides(reduced.limits, branching)]
+            branchings = self._branchings(reduced)[: max((LANES - len(children)) // 2, 1)]
+            plan = [(branching, self._children(reduced, branching)) for branching in branchings]
             plans.append((reduced, plan))
+            children += [child for _, pair in plan for child in pair]
             if not np.isfinite(search.value):
                 break
-        if not lanes:
-            return
-        limits, possible = tighten(
-            search.chains, MoveLimits(*map(np.array, zip(*(lane[0] for lane in lanes), strict=True)))
-        )
-        result = yield from self._relaxed(limits, possible, [lane[1] for lane in lanes])
+        yield from self._relaxed(children)
         for node, plan in plans:
-            self._chosen(node, plan, limits, possible, result)
-        yield from self._rounded(result)
+            self._chosen(node, plan)
+        yield from self._rounded(children)
 
-    def _relaxed(self, limits: MoveLimits, possible: np.ndarray, starts) -> Steps:
-        """Relax the possible lanes; returns a dictionary from lane to results and place in them."""
+    def _relaxed(self, children: list[_Child]) -> Steps:
+        """Relax the children whose limits leave anything, in one batch."""
+        search = self.search
+        if not children:
+            return
+        together = MoveLimits(*map(np.array, zip(*(child.limits for child in children), strict=True)))
+        together, possible = tighten(search.chains, together)
         chosen = np.flatnonzero(possible)
         if not len(chosen):
-            return {}
-        part = MoveLimits(*(values[chosen] for values in limits))
-        result = yield from self.search.relax(
-            part.lower, part.upper, [starts[k] for k in chosen], (part.low, part.high)
-        )
-        self.search.nodes += len(chosen)
-        for lane in range(len(chosen)):
-            self.search.offer(result, lane)
-        return {int(k): (result, lane) for lane, k in enumerate(chosen)}
+            return
+        lower, upper = together.lower[chosen], together.upper[chosen]
+        rows = needed(search.chains, MoveLimits(*(values[chosen] for values in together)))
+        result = yield from search.relax(lower, upper, [children[k].start for k in chosen], rows)
+        search.nodes += len(chosen)
+        for lane, k in enumerate(chosen):
+            children[k].limits, children[k].solved = together.lane(int(k)), (result, lane)
+            search.offer(result, lane)
 
     # ---- what a relaxed node proves
     def priced(self, model: LowerModel, result: Relaxations, lane: int, limits: MoveLimits) -> LowerModel:
-        """The lower model with the prices of the position rows of the same solve."""
+        """The lower model with the prices of the position rows of the same solve, which had these limits."""
         price = result.warm.hard_price[lane][self.search.position_rows]
         return dataclasses.replace(model, positions=PositionPrices(price, limits.low, limits.high))
 
@@ -265,73 +268,77 @@ class _Tree:
         row = int(free[k])
         return _Branching(row, int(min(place[k], limits.upper[row] - 1)), (0.0, 0.0))
 
-    def _sides(self, limits: MoveLimits, branching: _Branching) -> tuple[MoveLimits, MoveLimits]:
-        """Limits of the two children."""
-        count = len(limits.lower)
-        which, row = (0, branching.row) if branching.row < count else (2, branching.row - count)
-        down, up = list(limits), list(limits)
-        down[which + 1], up[which] = limits[which + 1].copy(), limits[which].copy()
-        down[which + 1][row] = min(limits[which + 1][row], branching.cut)
-        up[which][row] = max(limits[which][row], branching.cut + 1)
-        return MoveLimits(*down), MoveLimits(*up)
+    def _children(self, node: _Node, branching: _Branching) -> tuple[_Child, _Child]:
+        """The children, not relaxed yet: at most the cut, and more."""
+        count = len(node.limits.lower)
+        row = branching.row % count
+        down, up = (_Child(MoveLimits(*map(np.copy, node.limits)), node.start) for _ in range(2))
+        if branching.row < count:
+            down.limits.upper[row], up.limits.lower[row] = branching.cut, branching.cut + 1
+        else:
+            down.limits.high[row], up.limits.low[row] = branching.cut, branching.cut + 1
+        return down, up
 
-    def _chosen(self, node: _Node, plan, limits: MoveLimits, possible, results) -> None:
+    def _chosen(self, node: _Node, plan: list[tuple[_Branching, tuple[_Child, _Child]]]) -> None:
         """Keep the children of the best branching; the others' tell gains, and prune."""
         search = self.search
         kept, best, bound = node.limits, None, node.bound
-        for branching, first in plan:
-            sides = self._sides(node.limits, branching)
-            bounds = [np.inf, np.inf]
-            for side in (0, 1):
-                lane = first + side
-                if possible[lane]:
-                    result, place = results[lane]
-                    found = float(result.bound[place])
-                    bounds[side] = max(
-                        node.model.value + branching.estimate[side], found if found > -np.inf else -np.inf
-                    )
-                    self._learn(node, branching, side, bounds[side])
-                    if (limits.lower[lane] == limits.upper[lane]).all():
-                        bounds[side] = self._leaf(limits.lane(lane), bounds[side], result, place)
+        for branching, pair in plan:
+            bounds = [self._bound(node, branching, side, child) for side, child in enumerate(pair)]
             bound = max(bound, min(bounds))
-            gains = np.array(bounds) - node.bound
-            score = float(self._score(gains[0], gains[1], node.bound))
+            score = float(self._score(bounds[0] - node.bound, bounds[1] - node.bound, node.bound))
             if best is None or score > best[0]:
-                best = (score, branching, first, bounds)
-            for side in (0, 1):
+                best = (score, pair, bounds)
+            for side, other in enumerate(reversed(self._children(node, branching))):
                 if bounds[side] >= search.cutoff:
                     search.discard(bounds[side])
-                    kept = _both(kept, sides[1 - side])
+                    kept = _both(kept, other.limits)
         assert best is not None
         if bound >= search.cutoff:
             search.discard(bound)
             return
-        _, branching, first, bounds = best
-        children = []
-        for side in (0, 1):
-            lane = first + side
-            if not possible[lane] or bounds[side] >= search.cutoff:
-                continue
-            result, place = results[lane]
-            own = limits.lane(lane)
-            tight, good = tighten(search.chains, MoveLimits(*(v[None] for v in _both(own, kept))))
-            if not good[0]:
-                continue
-            if np.isfinite(result.x[place]).all() and np.isfinite(result.bound[place]):
-                model = search.lower_model(result, place, own.lower, own.upper)
-                model = self.priced(model, result, place, own)
-                start = result.start(place)
-            else:  # nothing was learnt: the parent's prices hold here, too
-                model, start = node.model, node.start
-            children.append(_Node(max(bound, bounds[side]), tight.lane(0), model, start))
-        children.sort(key=lambda child: child.bound)
-        for child in children:
-            least = min(self.least, child.bound)
-            near = child.bound - least <= PLUNGE * (search.cutoff - least)
-            if self.next is None and (near or not np.isfinite(search.value)):
-                self.next = child
+        nodes = []
+        for child, least in zip(best[1], best[2], strict=True):
+            if least < search.cutoff:
+                own = self._node(node, child, kept, max(bound, least))
+                nodes += [] if own is None else [own]
+        for own in sorted(nodes, key=lambda own: own.bound):
+            least = min(self.least, own.bound)
+            near = not np.isfinite(search.value) or own.bound - least <= PLUNGE * (search.cutoff - least)
+            if self.next is None and near:
+                self.next = own
             else:
-                self._keep(child)
+                self.keep(own)
+
+    def _bound(self, node: _Node, branching: _Branching, side: int, child: _Child) -> float:
+        """The bound of a child, infinite where nothing of it is left; takes down what it gained."""
+        search, limits = self.search, child.limits
+        if child.solved is None:
+            return np.inf
+        result, lane = child.solved
+        bound = max(
+            node.model.value + branching.estimate[side], float(result.bound[lane])
+        )  # NaN is not larger
+        self._learn(node, branching, side, bound)
+        if (limits.lower < limits.upper).any():
+            return bound
+        if satisfied(search.chains, limits.lower[None], limits.lower, limits.upper)[0]:
+            search.seen.add(limits.lower.tobytes())
+            search.discard(float(min(bound, result.snapped[lane])))
+        return np.inf
+
+    def _node(self, parent: _Node, child: _Child, kept: MoveLimits, bound: float) -> _Node | None:
+        """The node of a relaxed child within what its siblings have left; None where that is nothing."""
+        assert child.solved is not None
+        limits = _both(kept, child.limits)
+        tight, good = tighten(self.search.chains, MoveLimits(*(values[None] for values in limits)))
+        if not good[0]:
+            return None
+        (result, lane), model, start = child.solved, parent.model, parent.start
+        if np.isfinite(result.x[lane]).all() and np.isfinite(result.bound[lane]):
+            model = self.search.lower_model(result, lane, child.limits.lower, child.limits.upper)
+            model, start = self.priced(model, result, lane, child.limits), result.start(lane)
+        return _Node(bound, tight.lane(0), model, start)
 
     def _learn(self, node: _Node, branching: _Branching, side: int, bound: float) -> None:
         """Take down what one child gained per step."""
@@ -341,21 +348,14 @@ class _Tree:
             self.gains[side, branching.row] += max(bound - node.bound, 0.0) / away
             self.seen[side, branching.row] += 1
 
-    def _leaf(self, limits: MoveLimits, bound: float, result: Relaxations, place: int) -> float:
-        """A child without free moves is done: takes it down, and returns infinity for what is left of it."""
-        search = self.search
-        if satisfied(search.chains, limits.lower[None], limits.lower, limits.upper)[0]:
-            search.seen.add(limits.lower.tobytes())
-            search.discard(float(min(bound, result.snapped[place])))
-        return np.inf
-
     # ---- incumbents and lists
-    def _rounded(self, results) -> Steps:
+    def _rounded(self, children: list[_Child]) -> Steps:
         """Round moves and positions of relaxed lanes, and solve what may be better than the incumbent."""
         search, c = self.search, self.search.constants
-        if not results:
+        solved = [child.solved for child in children if child.solved is not None]
+        if not solved:
             return
-        moves = np.array([result.x[place, c.integer] for result, place in results.values()])
+        moves = np.array([result.x[lane, c.integer] for result, lane in solved])
         moves = np.unique(np.concatenate([np.round(moves), self._walked(moves)]), axis=0)
         moves = moves[np.isfinite(moves).all(axis=1)].astype(int)
         low, high = (np.round(values[c.integer]).astype(int) for values in search.limits)

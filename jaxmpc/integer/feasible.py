@@ -146,6 +146,37 @@ def tighten(chains: list[Chain], limits: MoveLimits) -> tuple[MoveLimits, np.nda
     return limits, np.asarray(good.all(axis=1))
 
 
+def needed(chains: list[Chain], limits: MoveLimits) -> tuple[np.ndarray, np.ndarray]:
+    """Limits of positions ``"batch integer"`` that do not follow from others and the moves', the rest `UNBOUNDED`.
+
+    Rows that follow from others tell a relaxation nothing, and their prices are not unique.
+    """
+    low, high = np.full_like(limits.low, -UNBOUNDED), np.full_like(limits.high, UNBOUNDED)
+    for chain in chains:
+        lower, upper, least, most = (values[:, chain.columns] for values in limits)
+        low[:, chain.columns] = _kept(least, lower * chain.counts, upper * chain.counts)
+        high[:, chain.columns] = -_kept(-most, -upper * chain.counts, -lower * chain.counts)
+    return low, high
+
+
+def _kept(low: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Of least positions those that steps within limits do not keep from the positions before and after."""
+    low = low.copy()
+    reached = np.zeros(len(low), dtype=int)
+    for b in range(low.shape[1]):
+        reached = reached + lower[:, b]
+        follows = low[:, b] <= reached
+        reached = np.maximum(reached, low[:, b])
+        low[follows, b] = -UNBOUNDED
+    reached = low[:, -1]
+    for b in range(low.shape[1] - 2, -1, -1):
+        reached = reached - upper[:, b + 1]
+        follows = low[:, b] <= reached
+        reached = np.maximum(reached, low[:, b])
+        low[follows, b] = -UNBOUNDED
+    return low
+
+
 def _sweep(chain: Chain, limits: MoveLimits) -> None:
     """One pass over a chain, in place: oscillation rows, positions reachable from both ends, moves between them."""
     counts, columns, place = chain.counts, chain.columns, np.arange(len(chain.columns))
