@@ -1,124 +1,443 @@
-"""Closing an integer problem by best-first branch and bound over relaxations, the last resort of `integer`.
+"""Closing an integer problem by branch and bound over relaxations, the last resort of `integer`.
 
-Every node tightens its limits by what its own prices exclude (`levelset`) and by the hard rows.
+A node limits the moves and the positions after them, and branches on a move or a position between two whole values. Which
+one is decided by reliability branching (Achterberg, Koch and Martin 2005): what earlier branchings gained tells, and
+where too few were seen the children of the best candidates are relaxed. The search follows the better child until
+it is pruned, then goes on from the least bound. Every node tightens its limits by what its own prices exclude
+(`lower_bound`) and by the hard rows, and is closed by a list where its level set is small.
 """
 
 from __future__ import annotations
 
-import contextlib
+import dataclasses
 import heapq
 import itertools
 
 import numpy as np
 
-from jaxmpc.integer.feasible import UndecidedError, propagate, satisfied
-from jaxmpc.integer.host_search import GROUP, Search, Steps
-from jaxmpc.integer.lower_bound import LowerModel, exclude
-from jaxmpc.integer.relaxer import Relaxations
+from jaxmpc.integer.cuts import Cuts
+from jaxmpc.integer.feasible import MoveLimits, needed, position_limits, satisfied, tighten, within
+from jaxmpc.integer.host_search import Search, Steps
+from jaxmpc.integer.lower_bound import LowerModel, PositionPrices, enumerate_below, exclude, radii
+from jaxmpc.integer.relaxer import LANES, Relaxations
+from jaxmpc.relaxed.newton import WarmStart
 
-HELD = 2**27  # prices of whole moves that open nodes may keep, a gigabyte
-MANY, BATCH = 64, 64  # nodes from which whole batches are solved, and their size
+HELD = 2**27  # numbers that open nodes may keep, a gigabyte
+RELIABLE = 3  # branchings of a variable in a direction from which their gains are believed
+TRIED = LANES // 2  # candidates whose children are relaxed before one is chosen
+PLUNGE = 0.25  # share of the gap that a child's bound may have used up for the search to follow it
+FRACTION = 1e-6  # distance from whole numbers that counts
+LISTED = 4_000  # partial assignments of a list at a node
+SURVIVORS = 64  # of a list, up to which it is worth to solve them
+KEPT = 4096  # sets of free moves whose radii are kept
+NEWEST = 64  # cuts that candidates are held against
+
+
+@dataclasses.dataclass(frozen=True)
+class _Node:
+    """A relaxed node; `limits` may be tighter than those of its `model`, whose center are its moves."""
+
+    bound: float
+    limits: MoveLimits
+    model: LowerModel
+    start: WarmStart
+
+    @property
+    def size(self) -> int:
+        """Numbers it keeps."""
+        prices = (
+            self.start.row_price,
+            self.start.limit_price,
+            self.start.envelope_price,
+            self.start.hard_price,
+        )
+        return self.model.excess.size + sum(np.size(part) for part in prices)
+
+
+@dataclasses.dataclass
+class _Child:
+    """What may become a node; `solved` are its relaxation's batch and lane, None where no whole moves are left."""
+
+    limits: MoveLimits
+    start: WarmStart
+    solved: tuple[Relaxations, int] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Branching:
+    """Two children: entry `row` (a move, or from `count` on a position) at most `cut`, or more; estimates of their gains."""
+
+    row: int
+    cut: int
+    estimate: tuple[float, float]
 
 
 def branch_and_bound(
-    search: Search, root: Relaxations, model: LowerModel, lower, upper, root_bound: float
+    search: Search, root: Relaxations, model: LowerModel, cuts: Cuts, lower, upper, root_bound: float
 ) -> Steps:
-    """Best-first branch and bound, a batch of nodes at a time; returns the least bound still open.
+    """Branch and bound; returns the least bound still open.
 
     `model` is the root's, over the limits the root was solved with; `lower` and `upper` may be tighter.
     """
-    c = search.constants
-    counter = itertools.count()
-    heap = [(root_bound, next(counter), lower, upper, model, root.x[0, c.integer], root.start(0))]
-    while heap:
-        if heap[0][0] >= search.cutoff:
-            search.discard(heap[0][0])
+    tree = _Tree(search, cuts)
+    limits = MoveLimits(lower, upper, *position_limits(search.chains))
+    tree.keep(_Node(root_bound, limits, tree.priced(model, root, 0, limits), root.start(0)))
+    while True:
+        least = tree.least
+        if least >= search.cutoff:
+            search.discard(least)
             return np.inf
-        if search.out_of_time() or len(heap) * heap[0][4].excess.size > HELD:
-            return heap[0][0]
-        children = []
-        width = GROUP if search.nodes < MANY or len(lower) > MANY else BATCH
-        while heap and len(children) < width - 1:
-            bound, _, low, high, model, center, start = heapq.heappop(heap)
-            if bound >= search.cutoff:
-                search.discard(bound)
+        if search.out_of_time() or tree.held > HELD:
+            return least
+        yield from tree.step()
+
+
+class _Tree:
+    """Open nodes of one search, and what its branchings have gained so far."""
+
+    def __init__(self, search: Search, cuts: Cuts):
+        self.search, self.cuts = search, cuts
+        count = len(search.constants.integer)
+        self.reach = np.zeros((count, count))  # row i: the position after move i
+        for chain in search.chains:
+            size = len(chain.columns)
+            self.reach[np.ix_(chain.columns, chain.columns)] = np.tri(size) * chain.counts
+        self.rows = np.concatenate([np.eye(count), self.reach])
+        self.gains, self.seen = np.zeros((2, 2 * count)), np.zeros((2, 2 * count), dtype=int)
+        self.heap: list[tuple[float, int, _Node]] = []
+        self.next: _Node | None = None  # the child that is followed
+        self.number = itertools.count()
+        self.held = 0
+        self.list_up_to = np.log(LISTED)  # logarithm of the estimated size up to which a list is tried
+        self.radii_of: dict[bytes, np.ndarray] = {}
+
+    # ---- open nodes
+    @property
+    def least(self) -> float:
+        """The least bound of an open node."""
+        followed = np.inf if self.next is None else self.next.bound
+        return min(followed, self.heap[0][0] if self.heap else np.inf)
+
+    def keep(self, node: _Node) -> None:
+        """Leave a node open."""
+        heapq.heappush(self.heap, (node.bound, next(self.number), node))
+        self.held += node.size
+
+    def _take(self) -> _Node | None:
+        """The node to go on with, None where all that is left cannot be better than the incumbent."""
+        node, self.next = self.next, None
+        while node is None and self.heap:
+            node = heapq.heappop(self.heap)[2]
+            self.held -= node.size
+        return node
+
+    # ---- one round
+    def step(self) -> Steps:
+        """Branch the followed node, and as many of least bound as fill a batch; keeps their children."""
+        search, plans, children = self.search, [], []
+        while len(children) < LANES and (node := self._take()) is not None:
+            if node.bound >= search.cutoff:
+                search.discard(node.bound)
                 continue
-            children += [(*child, start) for child in _split(bound, low, high, model, center)]
+            reduced = self._reduced(node)
+            if reduced is None:
+                continue
+            if (yield from self._listed(reduced)):
+                continue
+            branchings = self._branchings(reduced)[: max((LANES - len(children)) // 2, 1)]
+            plan = [(branching, self._children(reduced, branching)) for branching in branchings]
+            plans.append((reduced, plan))
+            children += [child for _, pair in plan for child in pair]
+            if not np.isfinite(search.value):
+                break
+        yield from self._relaxed(children)
+        for node, plan in plans:
+            self._chosen(node, plan)
+        yield from self._rounded(children)
+
+    def _relaxed(self, children: list[_Child]) -> Steps:
+        """Relax the children whose limits leave anything, in one batch."""
+        search = self.search
         if not children:
-            continue
-        low, high = np.array([ch[1] for ch in children]), np.array([ch[2] for ch in children])
-        low, high, possible = propagate(search.chains, low, high)
-        bounds = np.array([ch[0] for ch in children])
-        low, high, bounds = low[possible], high[possible], bounds[possible]
-        starts = [child[3] for child, keep in zip(children, possible, strict=True) if keep]
-        if not len(low):
-            continue
-        result = yield from search.relax(low, high, starts)
-        search.nodes += len(low)
-        leaf = (low == high).all(axis=1)
-        candidates = []
-        for i in range(len(low)):
-            bounds[i] = max(bounds[i], float(result.bound[i]))
-            if leaf[i]:
-                if satisfied(search.chains, low[i : i + 1], low[i], high[i])[0]:
-                    search.seen.add(low[i].tobytes())
-                    search.offer(result, i)
-                    search.discard(float(min(bounds[i], result.snapped[i])))
-            elif bounds[i] < search.cutoff:
-                search.offer(result, i)
-                with contextlib.suppress(UndecidedError):
-                    candidates.append(search.rounded(result.x[i, c.integer], low[i], high[i]))
-        points = search.new(candidates)[:GROUP]
+            return
+        together = MoveLimits(*map(np.array, zip(*(child.limits for child in children), strict=True)))
+        together, possible = tighten(search.chains, together)
+        chosen = np.flatnonzero(possible)
+        if not len(chosen):
+            return
+        lower, upper = together.lower[chosen], together.upper[chosen]
+        rows = needed(search.chains, MoveLimits(*(values[chosen] for values in together)))
+        result = yield from search.relax(lower, upper, [children[k].start for k in chosen], rows)
+        search.nodes += len(chosen)
+        for lane, k in enumerate(chosen):
+            children[k].limits, children[k].solved = together.lane(int(k)), (result, lane)
+            search.offer(result, lane)
+
+    # ---- what a relaxed node proves
+    def priced(self, model: LowerModel, result: Relaxations, lane: int, limits: MoveLimits) -> LowerModel:
+        """The lower model with the prices of the position rows of the same solve, which had these limits."""
+        price = result.warm.hard_price[lane][self.search.position_rows]
+        return dataclasses.replace(model, positions=PositionPrices(price, limits.low, limits.high))
+
+    def _radii(self, model: LowerModel) -> np.ndarray:
+        """`lower_bound.radii` of moves and positions, with the moves held that the node was solved with fixed."""
+        free = model.upper > model.lower
+        key = free.tobytes()
+        if key not in self.radii_of:
+            if len(self.radii_of) > KEPT:
+                self.radii_of.clear()
+            held = self.search.constants.schur[np.ix_(free, free)]
+            self.radii_of[key] = radii(held, self.rows[:, free]) if free.any() else np.zeros(len(self.rows))
+        return np.maximum(self.radii_of[key], 1e-300)
+
+    def _reduced(self, node: _Node) -> _Node | None:
+        """The node without what its prices exclude, None if that is everything."""
+        search, model = self.search, node.model
+        if not np.isfinite(search.cutoff):
+            return node
+        count, cutoff = len(model.center), search.cutoff
+        radius = self._radii(model)
+        lower, upper = exclude(dataclasses.replace(model, radius=radius[:count]), cutoff)
+        left = max(cutoff - model.value, 1e-300)
+        room = np.sqrt(2.0 * left * radius[count:])
+        position = self.reach @ model.center
+        low, high = position - room, position + room
+        prices = model.positions
+        if prices is not None:
+            step = np.abs(prices.price)
+            far = np.where(step > 0, left / np.where(step > 0, step, 1.0), np.inf)
+            low = np.where(prices.price > 0, np.maximum(low, prices.high - far), low)
+            high = np.where(prices.price < 0, np.minimum(high, prices.low + far), high)
+        limits = node.limits
+        low = np.maximum(limits.low, np.ceil(np.clip(low, -1e15, 1e15) - 1e-9)).astype(int)
+        high = np.minimum(limits.high, np.floor(np.clip(high, -1e15, 1e15) + 1e-9)).astype(int)
+        search.discard(max(node.bound, cutoff))
+        tight = MoveLimits(np.maximum(limits.lower, lower), np.minimum(limits.upper, upper), low, high)
+        tight, good = tighten(search.chains, MoveLimits(*(values[None] for values in tight)))
+        return dataclasses.replace(node, limits=tight.lane(0)) if good[0] else None
+
+    # ---- branching
+    def _branchings(self, node: _Node) -> list[_Branching]:
+        """The branchings whose children are to be relaxed, the most promising first."""
+        limits, model = node.limits, node.model
+        count = len(model.center)
+        at = self.rows @ model.center
+        low, high = np.concatenate([limits.lower, limits.low]), np.concatenate([limits.upper, limits.high])
+        cut = np.clip(np.floor(at), low, high - 1).astype(int)
+        part = at - cut
+        between = (high > low) & (part > FRACTION) & (part < 1.0 - FRACTION)
+        for chain in self.search.chains:  # the first position is the first move
+            between[count + chain.columns[0]] = False
+        rows = np.flatnonzero(between)
+        if not len(rows):
+            return [self._halved(node)]
+        away = np.stack([part, 1.0 - part])
+        radius = self._radii(model)
+        gain = np.where(np.isfinite(radius), 0.5 * away**2 / radius, 0.0)
+        moves = rows[rows < count]
+        gain[0, moves] += model.excess[moves, cut[moves] - model.lower[moves]]
+        gain[1, moves] += model.excess[moves, cut[moves] + 1 - model.lower[moves]]
+        estimate = gain.copy()
+        for kind in (slice(0, count), slice(count, None)):
+            total, seen = self.gains[:, kind].sum(axis=1), self.seen[:, kind].sum(axis=1)
+            mean = total / np.maximum(seen, 1)
+            own = self.gains[:, kind] / np.maximum(self.seen[:, kind], 1)
+            known = np.where(self.seen[:, kind] > 0, own, mean[:, None])
+            estimate[:, kind] = np.maximum(estimate[:, kind], known * away[:, kind])
+        score = self._score(estimate[0], estimate[1], node.bound)
+        best = rows[np.argsort(-score[rows], kind="stable")[:TRIED]]
+        reliable = self.seen[:, best].min(axis=0) >= RELIABLE
+        tried = [row for k, row in enumerate(best) if k == 0 or not reliable[k]]
+        return [_Branching(int(r), int(cut[r]), (float(gain[0, r]), float(gain[1, r]))) for r in tried]
+
+    def _score(self, down, up, bound: float):
+        """Of a branching by the gains of its children."""
+        room = self.search.cutoff - bound
+        least = 1e-6 * self.search.reference if np.isfinite(self.search.value) else 1e-12
+        return np.maximum(np.minimum(down, room), least) * np.maximum(np.minimum(up, room), least)
+
+    def _halved(self, node: _Node) -> _Branching:
+        """All moves are whole, but the relaxation is not exact there: separate the dearest move's value from others."""
+        limits, model = node.limits, node.model
+        free = np.flatnonzero(limits.upper > limits.lower)
+        if not len(free):
+            return _Branching(0, int(limits.lower[0]), (0.0, 0.0))
+        place = np.clip(np.round(model.center[free]), limits.lower[free], limits.upper[free]).astype(int)
+        own = model.excess[free, place - model.lower[free]]
+        k = int(np.argmax(own + 1e-9 * (limits.upper - limits.lower)[free]))
+        row = int(free[k])
+        return _Branching(row, int(min(place[k], limits.upper[row] - 1)), (0.0, 0.0))
+
+    def _children(self, node: _Node, branching: _Branching) -> tuple[_Child, _Child]:
+        """The children, not relaxed yet: at most the cut, and more."""
+        count = len(node.limits.lower)
+        row = branching.row % count
+        down, up = (_Child(MoveLimits(*map(np.copy, node.limits)), node.start) for _ in range(2))
+        if branching.row < count:
+            down.limits.upper[row], up.limits.lower[row] = branching.cut, branching.cut + 1
+        else:
+            down.limits.high[row], up.limits.low[row] = branching.cut, branching.cut + 1
+        return down, up
+
+    def _chosen(self, node: _Node, plan: list[tuple[_Branching, tuple[_Child, _Child]]]) -> None:
+        """Keep the children of the best branching; the others' tell gains, and prune."""
+        search = self.search
+        kept, best, bound = node.limits, None, node.bound
+        for branching, pair in plan:
+            bounds = [self._bound(node, branching, side, child) for side, child in enumerate(pair)]
+            bound = max(bound, min(bounds))
+            score = float(self._score(bounds[0] - node.bound, bounds[1] - node.bound, node.bound))
+            if best is None or score > best[0]:
+                best = (score, pair, bounds)
+            for side, other in enumerate(reversed(self._children(node, branching))):
+                if bounds[side] >= search.cutoff:
+                    search.discard(bounds[side])
+                    kept = _both(kept, other.limits)
+        assert best is not None
+        if bound >= search.cutoff:
+            search.discard(bound)
+            return
+        nodes = []
+        for child, least in zip(best[1], best[2], strict=True):
+            if least < search.cutoff:
+                own = self._node(node, child, kept, max(bound, least))
+                nodes += [] if own is None else [own]
+        for own in sorted(nodes, key=lambda own: own.bound):
+            least = min(self.least, own.bound)
+            near = not np.isfinite(search.value) or own.bound - least <= PLUNGE * (search.cutoff - least)
+            if self.next is None and near:
+                self.next = own
+            else:
+                self.keep(own)
+
+    def _bound(self, node: _Node, branching: _Branching, side: int, child: _Child) -> float:
+        """The bound of a child, infinite where nothing of it is left; takes down what it gained."""
+        search, limits = self.search, child.limits
+        if child.solved is None:
+            return np.inf
+        result, lane = child.solved
+        bound = max(
+            node.model.value + branching.estimate[side], float(result.bound[lane])
+        )  # NaN is not larger
+        self._learn(node, branching, side, bound)
+        if (limits.lower < limits.upper).any():
+            return bound
+        if satisfied(search.chains, limits.lower[None], limits.lower, limits.upper)[0]:
+            search.seen.add(limits.lower.tobytes())
+            search.discard(float(min(bound, result.snapped[lane])))
+        return np.inf
+
+    def _node(self, parent: _Node, child: _Child, kept: MoveLimits, bound: float) -> _Node | None:
+        """The node of a relaxed child within what its siblings have left; None where that is nothing."""
+        assert child.solved is not None
+        limits = _both(kept, child.limits)
+        tight, good = tighten(self.search.chains, MoveLimits(*(values[None] for values in limits)))
+        if not good[0]:
+            return None
+        (result, lane), model, start = child.solved, parent.model, parent.start
+        if np.isfinite(result.x[lane]).all() and np.isfinite(result.bound[lane]):
+            model = self.search.lower_model(result, lane, child.limits.lower, child.limits.upper)
+            model, start = self.priced(model, result, lane, child.limits), result.start(lane)
+        return _Node(bound, tight.lane(0), model, start)
+
+    def _learn(self, node: _Node, branching: _Branching, side: int, bound: float) -> None:
+        """Take down what one child gained per step."""
+        at = float(self.rows[branching.row] @ node.model.center)
+        away = at - branching.cut if side == 0 else branching.cut + 1 - at
+        if away > FRACTION and np.isfinite(bound):
+            self.gains[side, branching.row] += max(bound - node.bound, 0.0) / away
+            self.seen[side, branching.row] += 1
+
+    # ---- incumbents and lists
+    def _rounded(self, children: list[_Child]) -> Steps:
+        """Round moves and positions of relaxed lanes, and solve what may be better than the incumbent."""
+        search, c = self.search, self.search.constants
+        solved = [child.solved for child in children if child.solved is not None]
+        if not solved:
+            return
+        moves = np.array([result.x[lane, c.integer] for result, lane in solved])
+        moves = np.unique(np.concatenate([np.round(moves), self._walked(moves)]), axis=0)
+        moves = moves[np.isfinite(moves).all(axis=1)].astype(int)
+        low, high = (np.round(values[c.integer]).astype(int) for values in search.limits)
+        points = search.new(list(moves[satisfied(search.chains, moves, low, high)]))
+        yield from self._solve_best(points)
+
+    def _walked(self, moves: np.ndarray) -> np.ndarray:
+        """Moves that follow the positions of relaxed ones as closely as whole moves can."""
+        result = np.zeros_like(moves)
+        for chain in self.search.chains:
+            wanted = np.cumsum(moves[:, chain.columns] * chain.counts, axis=1)
+            position = np.zeros(len(moves))
+            for b, column in enumerate(chain.columns):
+                result[:, column] = np.round((wanted[:, b] - position) / chain.counts[b])
+                position += result[:, column] * chain.counts[b]
+        return result
+
+    def _solve_best(self, points: np.ndarray) -> Steps:
+        """Solve the best of these points by the cuts, if any may be better than the incumbent; adds cuts."""
+        if not len(points):
+            return
+        bounds = self.cuts.bounds(points, max(len(self.cuts.list) - NEWEST, 0))
+        best = np.argsort(bounds, kind="stable")[:2]
+        best = best[bounds[best] < self.search.cutoff]
+        if len(best):
+            yield from self._solve(points[best])
+
+    def _solve(self, points: np.ndarray, bounds: np.ndarray | None = None) -> Steps:
+        """Solve whole moves, each for a cut and perhaps an incumbent."""
+        result = yield from self.search.evaluate(points, bounds)
+        self.search.nodes += len(points)
+        for lane, point in enumerate(points):
+            self.cuts.add(result, lane, point, point)
+
+    def _listed(self, node: _Node) -> Steps:
+        """Close a node by listing what its level set leaves; returns whether that was done."""
+        search, limits, model = self.search, node.limits, node.model
+        if not np.isfinite(search.value) or self._log_size(node) > self.list_up_to:
+            return False
+        chains = within(search.chains, limits)
+        found = enumerate_below(model, chains, limits.lower, limits.upper, search.cutoff, LISTED)
+        if found is None:
+            self.list_up_to -= 1.0
+            return False
+        points, bounds, _ = found
         if len(points):
-            yield from search.evaluate(points)
-        for i in map(int, np.flatnonzero(~leaf)):
-            if bounds[i] >= search.cutoff:
-                search.discard(float(bounds[i]))
-                continue
-            model = search.lower_model(result, i, low[i], high[i])
-            tight_low, tight_high = exclude(model, search.cutoff)
-            search.discard(max(float(bounds[i]), search.cutoff))
-            tight_low, tight_high, good = propagate(search.chains, tight_low[None], tight_high[None])
-            if good[0]:
-                entry = (
-                    float(bounds[i]),
-                    next(counter),
-                    tight_low[0],
-                    tight_high[0],
-                    model,
-                    result.x[i, c.integer],
-                    result.start(i),
-                )
-                heapq.heappush(heap, entry)
-    return np.inf
+            keep = satisfied(chains, points, limits.lower, limits.upper)
+            keep &= np.array([p.tobytes() not in search.seen for p in points], dtype=bool)
+            points, bounds = points[keep], bounds[keep]
+        first = max(len(self.cuts.list) - NEWEST, 0)
+        while True:
+            if len(points):
+                bounds = np.maximum(bounds, self.cuts.bounds(points, first))
+            alive = bounds < search.cutoff
+            if not alive.all():
+                search.discard(float(bounds[~alive].min()))
+            points, bounds = points[alive], bounds[alive]
+            if not len(points):
+                search.discard(search.cutoff)
+                self.list_up_to += 0.1
+                return True
+            if len(points) > SURVIVORS or search.out_of_time():
+                self.list_up_to -= 0.5
+                return False
+            first = len(self.cuts.list)
+            best = np.argsort(bounds, kind="stable")
+            chosen, rest = best[:LANES], best[LANES:]
+            yield from self._solve(points[chosen], bounds[chosen])
+            points, bounds = points[rest], bounds[rest]
+
+    def _log_size(self, node: _Node) -> float:
+        """Logarithm of the whole moves in the node's level set, estimated by its box and by its volume."""
+        free = node.limits.upper > node.limits.lower
+        box = float(np.log((node.limits.upper - node.limits.lower + 1.0)[free]).sum())
+        return box
 
 
-def _split(bound: float, low, high, model: LowerModel, center) -> list[tuple]:
-    """Two children of a node, on the move whose better side costs most by the node's own prices."""
-    free = np.flatnonzero(high > low)
-    if not len(free):
-        return [(bound, low, high)]
-    best, choice = -1.0, (free[0], low[free[0]])
-    for i in free:
-        values = np.arange(low[i], high[i] + 1)
-        away = values - center[i]
-        curve = 0.5 * away**2 / model.radius[i] if np.isfinite(model.radius[i]) else np.zeros(len(values))
-        cost = model.excess[i, values - model.lower[i]] + curve
-        cut = int(np.clip(np.floor(center[i] + 1e-9), low[i], high[i] - 1))
-        if (
-            abs(center[i] - np.round(center[i])) < 1e-6
-        ):  # whole already: separate the cheapest value from the rest
-            cut = int(np.clip(np.round(center[i]), low[i], high[i] - 1))
-        down, up = cost[values <= cut].min(), cost[values > cut].min()
-        score = min(down, up) * (1.0 + 1e-3) + 1e-3 * max(down, up)
-        if score > best:
-            best, choice = score, (i, cut)
-    i, cut = choice
-    left, right = high.copy(), low.copy()
-    left[i], right[i] = cut, cut + 1
-    values = np.arange(low[i], high[i] + 1)
-    cost = model.value + model.excess[i, values - model.lower[i]]
-    return [
-        (max(bound, cost[values <= cut].min()), low, left),
-        (max(bound, cost[values > cut].min()), right, high),
-    ]
+def _both(one: MoveLimits, other: MoveLimits) -> MoveLimits:
+    """What lies within both limits."""
+    return MoveLimits(
+        np.maximum(one.lower, other.lower),
+        np.minimum(one.upper, other.upper),
+        np.maximum(one.low, other.low),
+        np.minimum(one.high, other.high),
+    )

@@ -8,6 +8,7 @@ propagate along the chain, and a dynamic programme over (position, last move) de
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -88,22 +89,98 @@ def propagate(
     Returns:
         ``(lower, upper, possible)``: the tightened copies, and per lane whether no domain is empty.
     """
-    lower, upper = lower.copy(), upper.copy()
-    for _ in range(2 * lower.shape[1]):
-        before = (lower.copy(), upper.copy())
+    low, high = (np.broadcast_to(limits, lower.shape) for limits in position_limits(chains))
+    tight, possible = tighten(chains, MoveLimits(lower, upper, low, high))
+    return tight.lower, tight.upper, possible
+
+
+class MoveLimits(NamedTuple):
+    """Limits of integer moves and of the positions after them, ``"integer"`` or ``"batch integer"`` [steps]."""
+
+    lower: Int[np.ndarray, "..."]
+    upper: Int[np.ndarray, "..."]
+    low: Int[np.ndarray, "..."]
+    high: Int[np.ndarray, "..."]
+
+    def lane(self, k: int) -> MoveLimits:
+        """Those of one lane of a batch."""
+        return MoveLimits(*(values[k] for values in self))
+
+
+def position_limits(chains: list[Chain]) -> tuple[np.ndarray, np.ndarray]:
+    """Limits of the positions after all integer moves that the hard rows themselves set, ``"integer"`` [steps]."""
+    low, high = (np.zeros(sum(len(chain.columns) for chain in chains), dtype=int) for _ in range(2))
+    for chain in chains:
+        low[chain.columns], high[chain.columns] = chain.low, chain.high
+    return low, high
+
+
+def within(chains: list[Chain], limits: MoveLimits) -> list[Chain]:
+    """The chains with the position limits of one lane."""
+    return [
+        dataclasses.replace(chain, low=limits.low[chain.columns], high=limits.high[chain.columns])
+        for chain in chains
+    ]
+
+
+def tighten(chains: list[Chain], limits: MoveLimits) -> tuple[MoveLimits, np.ndarray]:
+    """Tighten limits of moves and positions ``"batch integer"`` along every chain until nothing changes.
+
+    Args:
+        chains: the hard rows; their positions are not read, the limits have their own.
+        limits: of every lane.
+
+    Returns:
+        The tightened copies, and per lane whether no domain is empty.
+    """
+    limits = MoveLimits(*(np.array(values) for values in limits))
+    for _ in range(2 * limits.lower.shape[1]):
+        before = [values.copy() for values in limits]
         for chain in chains:
-            _sweep(chain, lower, upper)
-        if np.array_equal(before[0], lower) and np.array_equal(before[1], upper):
+            _sweep(chain, limits)
+        if all(map(np.array_equal, before, limits)):
             break
-        if (lower > upper).any(axis=1).all():
+        if (limits.lower > limits.upper).any(axis=1).all():
             break
-    return lower, upper, np.asarray((lower <= upper).all(axis=1))
+    good = (limits.lower <= limits.upper) & (limits.low <= limits.high)
+    return limits, np.asarray(good.all(axis=1))
 
 
-def _sweep(chain: Chain, lower: np.ndarray, upper: np.ndarray) -> None:
+def needed(chains: list[Chain], limits: MoveLimits) -> tuple[np.ndarray, np.ndarray]:
+    """Limits of positions ``"batch integer"`` that do not follow from others and the moves', the rest `UNBOUNDED`.
+
+    Rows that follow from others tell a relaxation nothing, and their prices are not unique.
+    """
+    low, high = np.full_like(limits.low, -UNBOUNDED), np.full_like(limits.high, UNBOUNDED)
+    for chain in chains:
+        lower, upper, least, most = (values[:, chain.columns] for values in limits)
+        low[:, chain.columns] = _kept(least, lower * chain.counts, upper * chain.counts)
+        high[:, chain.columns] = -_kept(-most, -upper * chain.counts, -lower * chain.counts)
+    return low, high
+
+
+def _kept(low: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Of least positions those that steps within limits do not keep from the positions before and after."""
+    low = low.copy()
+    reached = np.zeros(len(low), dtype=int)
+    for b in range(low.shape[1]):
+        reached = reached + lower[:, b]
+        follows = low[:, b] <= reached
+        reached = np.maximum(reached, low[:, b])
+        low[follows, b] = -UNBOUNDED
+    reached = low[:, -1]
+    for b in range(low.shape[1] - 2, -1, -1):
+        reached = reached - upper[:, b + 1]
+        follows = low[:, b] <= reached
+        reached = np.maximum(reached, low[:, b])
+        low[follows, b] = -UNBOUNDED
+    return low
+
+
+def _sweep(chain: Chain, limits: MoveLimits) -> None:
     """One pass over a chain, in place: oscillation rows, positions reachable from both ends, moves between them."""
-    counts, place = chain.counts, np.arange(len(chain.columns))
-    own_low, own_high = lower[:, chain.columns], upper[:, chain.columns]
+    counts, columns, place = chain.counts, chain.columns, np.arange(len(chain.columns))
+    own_low, own_high, low, high = (values[:, columns] for values in limits)
     # |d_b - d_(b-1)| <= 1 lets a limit weaken by one per block; runs of coupled blocks are kept apart by a large offset
     run = np.cumsum(~chain.coupled) * (8 * UNBOUNDED)
     own_low = _running_max(own_low + place + run) - place - run
@@ -111,8 +188,8 @@ def _sweep(chain: Chain, lower: np.ndarray, upper: np.ndarray) -> None:
     own_low = _running_max_back(own_low - place - run) + place + run
     own_high = -_running_max_back(-own_high - place - run) - place - run
     # positions: forward from zero within the limits, then backward
-    low = _reach(chain.low, np.cumsum(own_low * counts, axis=1))
-    high = -_reach(-chain.high, -np.cumsum(own_high * counts, axis=1))
+    low = _reach(low, np.cumsum(own_low * counts, axis=1))
+    high = -_reach(-high, -np.cumsum(own_high * counts, axis=1))
     after = np.zeros_like(own_low)
     after[:, :-1] = own_high[:, 1:] * counts[1:]
     low = _back(low, after)
@@ -120,8 +197,9 @@ def _sweep(chain: Chain, lower: np.ndarray, upper: np.ndarray) -> None:
     high = -_back(-high, -after)
     before_low, before_high = np.zeros_like(low), np.zeros_like(high)
     before_low[:, 1:], before_high[:, 1:] = low[:, :-1], high[:, :-1]
-    lower[:, chain.columns] = np.maximum(own_low, -((before_high - low) // counts))
-    upper[:, chain.columns] = np.minimum(own_high, (high - before_low) // counts)
+    limits.lower[:, columns] = np.maximum(own_low, -((before_high - low) // counts))
+    limits.upper[:, columns] = np.minimum(own_high, (high - before_low) // counts)
+    limits.low[:, columns], limits.high[:, columns] = low, high
 
 
 def _running_max(values: np.ndarray) -> np.ndarray:

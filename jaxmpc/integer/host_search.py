@@ -13,9 +13,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxmpc.integer.feasible import Chain, chains_of, nearest, satisfied, whole
+from jaxmpc.integer.feasible import UNBOUNDED, Chain, chains_of, nearest, satisfied, whole
 from jaxmpc.integer.lower_bound import LowerModel
-from jaxmpc.integer.relaxer import Relaxations
+from jaxmpc.integer.relaxer import LaneLimits, Relaxations
 from jaxmpc.integer.tables import Constants
 from jaxmpc.problem.instance import QpInstance
 from jaxmpc.relaxed.gap import FINEST, closes, cutoff, reference
@@ -27,10 +27,9 @@ GROUP = 8  # problems a search asks for at once: as many as one small batch hold
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """Relaxed problems a search wants solved: limits of all moves ``"lane n"`` and where to start ``"lane"``."""
+    """Relaxed problems a search wants solved: their limits and where to start, first axis ``"lane"``."""
 
-    lower: np.ndarray
-    upper: np.ndarray
+    limits: LaneLimits
     starts: WarmStart
 
 
@@ -115,22 +114,41 @@ class Search:
         self.left_out = min(self.left_out, bound)
 
     # ---- relaxations
-    def relax(self, lower: np.ndarray, upper: np.ndarray, starts: list[WarmStart] | None = None) -> Steps:
+    @property
+    def position_rows(self) -> np.ndarray:
+        """Hard row of the position after every integer move."""
+        integer, size = self.constants.integer, self.constants.size
+        return integer // size.blocks * size.rows + integer % size.blocks
+
+    def relax(
+        self,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        starts: list[WarmStart] | None = None,
+        positions: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> Steps:
         """Solve relaxed problems with integer limits ``"batch integer"``; returns `Relaxations`.
 
         Args:
             lower: integer lower limits.
             upper: integer upper limits.
             starts: prices to start from, one per problem; the root's if not given.
+            positions: lower and upper limits of the position after every integer move [steps]; the problem's own if not
+                given.
         """
         count, integer = len(lower), self.constants.integer
-        wide_low, wide_high = (np.repeat(v[None], count, axis=0) for v in self.limits)
-        wide_low[:, integer], wide_high[:, integer] = lower, upper
+        own = *self.limits, np.asarray(self.instance.row_low), np.asarray(self.instance.row_high)
+        limits = LaneLimits(*(np.repeat(v[None], count, axis=0) for v in own))
+        limits.lower[:, integer], limits.upper[:, integer] = lower, upper
+        if positions is not None:
+            rows = self.position_rows
+            limits.row_low[:, rows] = np.where(positions[0] > -UNBOUNDED, positions[0], -np.inf)
+            limits.row_high[:, rows] = np.where(positions[1] < UNBOUNDED, positions[1], np.inf)
         if starts is None:
             stacked = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape)), self.start)
         else:
             stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *starts)
-        return (yield Request(wide_low, wide_high, stacked))
+        return (yield Request(limits, stacked))
 
     def offer(self, result: Relaxations, lane: int) -> None:
         """Take a solved problem with its integer moves rounded as incumbent if that is better."""

@@ -5,13 +5,15 @@ The prices of a relaxed solve give a quadratic lower bound of the whole problem 
     F(d) >= value + sum_i excess_i(d_i) + 1/2 (d - center)' S (d - center),
 
 with S the curvature that remains after the continuous moves have been minimised out, and excess_i >= 0 what the
-linearised move weight and the priced box leave out at the integers. It combines reduced-cost fixing with
-the level-set (strong convexity) radius. Only integers whose bound stays below the incumbent can improve on it.
+linearised move weight and the priced box leave out at the integers. Prices of the position rows add what a position
+stays away from a priced limit. It combines reduced-cost fixing with the level-set (strong convexity) radius. Only integers
+whose bound stays below the incumbent can improve on it.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -20,6 +22,24 @@ from jaxmpc.integer.feasible import Chain, satisfied
 
 GRID = 1024  # combinations up to which all are evaluated at once
 CELLS = 2**24  # partial assignments times values of the next move that are looked at together
+
+
+class PositionPrices(NamedTuple):
+    """What the limits of the positions after the integer moves cost, ``"integer"``.
+
+    Attributes:
+        price: per step, upper limit positive.
+        low, high: the limits of this solve [steps].
+    """
+
+    price: Float[np.ndarray, " integer"]
+    low: Int[np.ndarray, " integer"]
+    high: Int[np.ndarray, " integer"]
+
+    def excess(self, column: int, position: np.ndarray) -> np.ndarray:
+        """What the prices leave out at these positions after one move, within the limits."""
+        price = float(self.price[column])
+        return price * (self.high[column] - position) if price > 0 else -price * (position - self.low[column])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +55,7 @@ class LowerModel:
         radius: diagonal of the inverse of S; bounds one move with the others free.
         order: in which the moves are assigned one after the other, block by block.
         leading: R with R'R = S in that order, lower triangular, so that term i of |R d|^2 involves d_0..d_i only.
+        positions: prices of the position rows, None to leave them out.
     """
 
     value: float
@@ -46,6 +67,7 @@ class LowerModel:
     radius: Float[np.ndarray, " integer"]
     order: Int[np.ndarray, " integer"]
     leading: Float[np.ndarray, "integer integer"]
+    positions: PositionPrices | None = None
 
 
 def schur_complement(hessian: np.ndarray, integer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -72,11 +94,20 @@ def schur_complement(hessian: np.ndarray, integer: np.ndarray) -> tuple[np.ndarr
     # round-off must not add curvature: shave it off, then drop what is negative
     values = np.maximum(values - 1e-11 * top - 1e-13 * np.abs(hessian).max(initial=0.0), 0.0)
     block = (vectors * values) @ vectors.T
-    flat = values <= 1e-12 * top
-    with np.errstate(divide="ignore"):
-        radius = ((vectors**2) * np.where(flat, 0.0, 1.0 / np.where(flat, 1.0, values))).sum(axis=1)
-    radius = np.where(((vectors**2) * flat).sum(axis=1) > 1e-12, np.inf, radius)
-    return block, radius
+    return block, _radii(values, vectors)
+
+
+def radii(schur: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Diagonal of ``rows S^-1 rows'``: (r (d - center))^2 / (2 radius) is the least curvature cost of a row's value."""
+    values, vectors = np.linalg.eigh(schur)
+    return _radii(np.maximum(values, 0.0), rows @ vectors)
+
+
+def _radii(values: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Of rows given in the eigenvectors' basis; infinite where they have a part in directions without curvature."""
+    flat = values <= 1e-12 * values.max(initial=0.0)
+    radius = ((along**2) * np.where(flat, 0.0, 1.0 / np.where(flat, 1.0, values))).sum(axis=1)
+    return np.where(((along**2) * flat).sum(axis=1) > 1e-12, np.inf, radius)
 
 
 def root_factor(schur: np.ndarray) -> np.ndarray:
@@ -149,6 +180,8 @@ def enumerate_below(
         term = (moves @ row[:i] - row[: i + 1] @ center[: i + 1])[:, None] + row[i] * domain
         reached = position[:, k, None] + chain.counts[b] * domain
         total = bounds[:, None] + 0.5 * term**2 + own
+        if model.positions is not None and model.positions.price[column]:
+            total += np.maximum(model.positions.excess(column, reached), 0.0)
         good = (reached >= chain.low[b]) & (reached <= chain.high[b])
         if chain.coupled[b]:
             good &= np.abs(domain - moves[:, i - len(chains), None]) <= 1
@@ -183,6 +216,11 @@ def _grid_below(model: LowerModel, chains: list[Chain], lower, upper, sizes, cut
     away = (points - model.center)[:, model.order] @ model.leading.T
     own = model.excess[np.arange(len(lower)), points - model.lower].sum(axis=1)
     bounds = model.value + own + 0.5 * (away**2).sum(axis=1)
+    if model.positions is not None:
+        for chain in chains:
+            reached = np.cumsum(points[:, chain.columns] * chain.counts, axis=1)
+            for column, position in zip(chain.columns, reached.T, strict=True):
+                bounds += model.positions.excess(column, position)
     below = bounds < cutoff
     least = bounds[~below].min(initial=np.inf) if np.isfinite(cutoff) else np.inf
     points, bounds = points[below], bounds[below]

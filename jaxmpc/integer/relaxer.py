@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -76,18 +77,34 @@ class Relaxations:
         return Relaxations(*jax.tree.map(lambda leaf: leaf[begin:end], tuple(fields)))
 
 
+class LaneLimits(NamedTuple):
+    """Limits of relaxed problems, in the units of `QpInstance`; first axis is the lane.
+
+    Attributes:
+        lower, upper: of all moves.
+        row_low, row_high: of the hard rows.
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+    row_low: np.ndarray
+    row_high: np.ndarray
+
+
 @jax.jit
-def _relax(qps: Lanes, instances: QpInstance, index, lower, upper, starts, count) -> Relaxed:
+def _relax(qps: Lanes, instances: QpInstance, index, limits: LaneLimits, starts, count) -> Relaxed:
     """Relaxations of lanes that belong to the scenarios `index`; those from `count` on are not solved."""
     pick = lambda tree: jax.tree.map(lambda leaf: leaf[index], tree)  # noqa: E731
 
-    def lane(own, instance, lower, upper, start, there):
+    def lane(own, instance, limits: LaneLimits, start, there):
         # limits of no width leave nothing to solve
-        low, high = (jnp.where(there, v, 0.0) for v in (lower, upper))
+        low, high = (jnp.where(there, v, 0.0) for v in (limits.lower, limits.upper))
+        rows = limits.row_low, limits.row_high
+        instance = eqx.tree_at(lambda i: (i.row_low, i.row_high), instance, rows)
         return relax(eqx.combine(own, qps.shared), instance, low, high, start)
 
     there = jnp.arange(LANES) < count
-    return jax.vmap(lane)(pick(qps.each), pick(instances), lower, upper, starts, there)
+    return jax.vmap(lane)(pick(qps.each), pick(instances), limits, starts, there)
 
 
 class Relaxer:
@@ -129,8 +146,7 @@ class Relaxer:
         self,
         instances: QpInstance,
         index: np.ndarray,
-        lower: np.ndarray,
-        upper: np.ndarray,
+        limits: LaneLimits,
         starts: WarmStart,
     ) -> Relaxations:
         """Solve relaxed problems.
@@ -138,14 +154,13 @@ class Relaxer:
         Args:
             instances: problems of all scenarios, first axis ``"scenario"``.
             index: scenario of each lane.
-            lower: limits of all moves ``"lane n"``.
-            upper: the same.
+            limits: of every lane, in place of those of its scenario.
             starts: moves and prices to start from, ``"lane"``.
         """
         count, parts = len(index), []
         for begin in range(0, count, LANES):
             pad = np.minimum(begin + np.arange(LANES), count - 1)
-            some = jax.tree.map(lambda leaf, pad=pad: leaf[pad], (index, lower, upper, starts))
+            some = jax.tree.map(lambda leaf, pad=pad: leaf[pad], (index, limits, starts))
             used = min(LANES, count - begin)
             solved = _relax(self.qps, instances, *some, used)
             parts.append(jax.tree.map(lambda leaf, used=used: np.asarray(leaf)[:used], solved))
@@ -162,5 +177,6 @@ class Relaxer:
     def solve_roots(self, instances: QpInstance, warm: WarmStart) -> Relaxations:
         """Relaxations of all scenarios themselves, within their own limits."""
         index = np.arange(len(instances.lower))
-        lower, upper = np.asarray(instances.lower), np.asarray(instances.upper)
-        return self.solve(instances, index, lower, upper, jax.tree.map(np.asarray, warm))
+        own = (instances.lower, instances.upper, instances.row_low, instances.row_high)
+        limits = LaneLimits(*map(np.asarray, own))
+        return self.solve(instances, index, limits, jax.tree.map(np.asarray, warm))

@@ -91,15 +91,14 @@ def _timed(work):
 def _answer(relaxer: Relaxer, instances: QpInstance, asking: list[_Run]) -> None:
     """Solve what these searches wait for in shared batches, charge each for its lanes, and go on with them."""
     requests = [one.waits for one in asking if isinstance(one.waits, Request)]
-    counts = [len(request.lower) for request in requests]
+    counts = [len(request.limits.lower) for request in requests]
     index = np.repeat([one.number for one in asking], counts)
     join = lambda *leaves: leaves[0] if len(leaves) == 1 else np.concatenate(leaves)  # noqa: E731
     clock = Clock()
     result = relaxer.solve(
         instances,
         index,
-        join(*(request.lower for request in requests)),
-        join(*(request.upper for request in requests)),
+        jax.tree.map(join, *(request.limits for request in requests)),
         jax.tree.map(join, *(request.starts for request in requests)),
     )
     per_lane = clock.seconds / len(index)

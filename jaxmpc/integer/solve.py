@@ -153,7 +153,7 @@ def _line(search: Search, starts: Sequence[np.ndarray], finish: str, last: bool)
         root_bound = max(root_bound, min(bound, search.value))
         if done or finish == "highs" or search.out_of_time():
             return search.finish("highs" if done else None, root_bound)
-    bound = yield from branch_and_bound(search, root, model, lower, upper, root_bound)
+    bound = yield from branch_and_bound(search, root, model, cuts, lower, upper, root_bound)
     return search.finish("branch-and-bound", bound)
 
 

@@ -10,14 +10,17 @@ from jaxmpc import status
 from jaxmpc.integer import listing as compiled_lists
 from jaxmpc.integer import search as compiled_search
 from jaxmpc.integer.cuts import Cuts
-from jaxmpc.integer.feasible import Chain, nearest, propagate, satisfied
+from jaxmpc.integer.feasible import Chain, MoveLimits, nearest, propagate, satisfied, tighten, within
 from jaxmpc.integer.host_search import Search
 from jaxmpc.integer.lower_bound import enumerate_below, exclude
 from jaxmpc.integer.relaxer import Relaxer
 from jaxmpc.integer.scheduling import run
 from jaxmpc.integer.solve import FINISHES, solve_integers
 from jaxmpc.integer.tables import Constants
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import make_tuning
 from jaxmpc.programs.lanes import for_all
+from jaxmpc.relaxed.problem import evaluate
 from tests.posed import pose
 
 NONE = np.zeros((0, 4)), np.zeros(0), np.zeros(0)
@@ -59,6 +62,32 @@ def test_propagation_keeps_every_feasible_move_and_the_dynamic_programme_finds_t
             assert found is None
             infeasible_seen += 1
     assert min(feasible_seen, infeasible_seen) > 20
+
+
+def test_propagation_with_positions_of_each_lane_keeps_every_feasible_move_and_position():
+    rng = np.random.default_rng(3)
+    moves = np.array(list(itertools.product(range(-2, 3), repeat=4)))
+    lanes, feasible_seen, infeasible_seen = 10, 0, 0
+    for _ in range(60):
+        chain = random_chain(rng)
+        reached = np.cumsum(moves * chain.counts, axis=1)
+        lower, upper = -rng.integers(0, 3, size=(lanes, 4)), rng.integers(0, 3, size=(lanes, 4))
+        low = np.maximum(chain.low, rng.integers(-5, 1, size=(lanes, 4)))
+        high = np.minimum(chain.high, low + rng.integers(1, 6, size=(lanes, 4)))
+        given = MoveLimits(lower, upper, low, high)
+        tight, possible = tighten([chain], given)
+        for k in range(lanes):
+            own = given.lane(k)
+            good = satisfied(within([chain], own), moves, own.lower, own.upper)
+            if good.any():
+                assert possible[k]
+                for values, least, most in ((moves, 0, 1), (reached, 2, 3)):
+                    assert (values[good] >= tight[least][k]).all()
+                    assert (values[good] <= tight[most][k]).all()
+                feasible_seen += 1
+            else:
+                infeasible_seen += 1
+    assert min(feasible_seen, infeasible_seen) > 50
 
 
 def one(tree):
@@ -156,6 +185,72 @@ def test_every_path_finds_the_best_whole_plan_and_proves_it(problems, finish):
         assert result.bound <= best * (1 + 1e-8)
         if finish != "auto":
             assert result.finished_by == finish
+
+
+@pytest.mark.parametrize("actuators", ["on/off", "wide"])
+def test_branch_and_bound_alone_finds_the_best_plan_of_all(well_like_model, actuators):
+    """On/off valves without blocking, and valves of many steps that start off their limits."""
+    rng = np.random.default_rng(5)
+    wide = actuators == "wide"
+    blocks = (1, 1, 1) if wide else (1,) * 8
+    structure = Structure(
+        cv_names=("a", "b"),
+        mv_names=("u", "v") if wide else ("u",),
+        dt=30.0,
+        prediction_horizon=24,
+        control_horizon=len(blocks),
+        blocks=blocks,
+        integer_step=(1.0, 1.0) if wide else (1.0,),
+    )
+    used = structure.mv_count
+    coefficients = np.cumsum(rng.normal(size=(2, used, 30)) * np.exp(-np.arange(30) / 6.0), axis=2)
+    branched = 0
+    for k in range(6):
+        tuning = make_tuning(
+            structure,
+            cv_weight=[1.0, 0.5],
+            move_weight=[(0.0, 0.01, 0.3)[k % 3]] * used,
+            mv_low=[0.0] * used,
+            mv_high=[5.0 if wide else 1.0] * used,
+            cv_high=[2.0, 1.5],
+            cv_low=[-2.0, -1.5],
+            slack_weight=[5.0, 5.0],
+        )
+        posed = pose(
+            structure,
+            tuning,
+            coefficients,
+            free_response=np.cumsum(rng.normal(size=(40, 2)) * 0.3, axis=0),
+            setpoint=np.tile(rng.normal(size=2) * (3.0 if wide else 1.0), (40, 1)),
+            mv_now=[float(rng.integers(0, 6 if wide else 2))] * used,
+            envelope=0 if wide else 1,
+        )
+        instance = jax.tree.map(np.asarray, posed.instance)
+        constants = Constants(structure, posed.size, jax.tree.map(np.asarray, posed.qp))
+        search = started(constants, instance)
+        low, high = (np.round(v[constants.integer]).astype(int) for v in search.limits)
+        reached = itertools.product(range(6 if wide else 2), repeat=len(blocks))
+        start = -int(search.chains[0].low[0])
+        of_one = np.diff(np.array(list(reached)), axis=1, prepend=start)
+        pairs = itertools.product(of_one, repeat=used)
+        points = np.array([np.concatenate(pair) for pair in pairs])
+        points = points[satisfied(search.chains, points, low, high)]
+        values = np.array(
+            jax.vmap(evaluate, (None, None, 0))(posed.qp, posed.instance, widened(points, constants))
+        )
+        result = solve_integer(constants, instance, finish="branch-and-bound")
+        assert result.status == status.OPTIMAL
+        assert result.value == pytest.approx(values.min(), rel=1e-6)
+        assert result.bound <= values.min() * (1 + 1e-8)
+        branched += result.nodes > 3
+    assert branched > 0
+
+
+def widened(points, constants):
+    """Scaled moves of all MVs with these whole ones."""
+    x = np.zeros((len(points), constants.size.moves))
+    x[:, constants.integer] = points
+    return x
 
 
 def test_cuts_at_solved_plans_bound_every_plan_and_touch_their_own(problems):
