@@ -22,6 +22,7 @@ from jaxmpc.relaxed.gap import FINEST, closes, cutoff, reference
 from jaxmpc.relaxed.newton import WarmStart
 from jaxmpc.status import FAILED, INFEASIBLE, LIMIT, OPTIMAL
 
+NEARLY = 1e-12  # of a curvature, added where it may be singular
 GROUP = 8  # problems a search asks for at once: as many as one small batch holds
 
 
@@ -183,13 +184,16 @@ class Search:
             own = steep[:, None] * np.maximum(np.abs(values) - knot, 0.0)
             excess += own - price[:, None] * values + (knot * np.abs(price))[:, None]
         value = float(result.bound[lane])
-        if len(result.position[lane]):  # complete the square: the same bound about another center
+        if len(result.position[lane]):  # complete the square: the same bound about another center of what is free
             more, bend = c.of_chords(result.position[lane], center)
-            step = c.inverse @ bend
-            rest = bend - c.schur @ step  # next to nothing
+            step, free = np.zeros(len(center)), np.flatnonzero(upper > lower)
+            own = c.schur[np.ix_(free, free)]
+            step[free] = np.linalg.solve(own + NEARLY * own.trace() * np.eye(len(free)), bend[free])
+            bent = c.schur @ step
+            rest = np.where(upper > lower, bend - bent, 0.0)  # next to nothing
             least = np.minimum(rest * (lower - center), rest * (upper - center))
             excess += rest[:, None] * (values - center[:, None]) - least[:, None]
-            value += more + least.sum() - 0.5 * (2.0 * bend - c.schur @ step) @ step
+            value += more + least.sum() - 0.5 * step @ bent
             center = center - step
         excess = np.where(values <= upper[:, None], np.maximum(excess, 0.0), np.inf)
         return LowerModel(value, center, lower, upper, excess, c.schur, c.radius, c.order, c.leading)

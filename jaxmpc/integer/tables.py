@@ -125,11 +125,6 @@ class Constants:
         value = (weight * w**2 - own * w + own * k - weight * k**2).sum()
         return float(value), self.reached.T @ (2.0 * weight * w - own)
 
-    @functools.cached_property
-    def inverse(self) -> np.ndarray:
-        """Of `schur`, on the directions that have curvature."""
-        return np.linalg.pinv(self.schur, hermitian=True)
-
     def tables(self, integers: int) -> Tables:
         """For the compiled search, with room for so many integer moves."""
         structure, size, order = self.structure, self.size, self.order
