@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-LEAST = 1e-6  # of the largest curvature of a position: shares below it are not worth their chords
+LEAST = 1e-2  # of the largest share: smaller ones tighten next to nothing and leave the objective flatter
 SAFE = 1e-9  # share of the curvature that stays, so that rounding leaves the objective convex
 
 
@@ -59,7 +59,7 @@ def chord_weights(curvature: Float[np.ndarray, "position position"]) -> Float[np
     if not np.isfinite(found).all():
         return nothing
     found = np.where(found > LEAST, np.maximum(found, 0.0), 0.0)
-    return _convex_share(scaled, found) * found * unit**2
+    return 0.9 * _convex_share(scaled, found) * found * unit**2
 
 
 def _convex_share(curvature: np.ndarray, found: np.ndarray) -> float:
