@@ -16,7 +16,16 @@ import itertools
 import numpy as np
 
 from jaxmpc.integer.cuts import Cuts
-from jaxmpc.integer.feasible import MoveLimits, needed, position_limits, satisfied, tighten, within
+from jaxmpc.integer.feasible import (
+    MoveLimits,
+    around,
+    needed,
+    position_limits,
+    satisfied,
+    tighten,
+    whole,
+    within,
+)
 from jaxmpc.integer.host_search import Search, Steps
 from jaxmpc.integer.lower_bound import LowerModel, PositionPrices, enumerate_below, exclude, radii
 from jaxmpc.integer.relaxer import LANES, Relaxations
@@ -28,8 +37,10 @@ TRIED = LANES // 2  # candidates whose children are relaxed before one is chosen
 PLUNGE = 0.25  # share of the gap that a child's bound may have used up for the search to follow it
 FRACTION = 1e-6  # distance from whole numbers that counts
 LISTED = 4_000  # partial assignments of a list at a node
+HOPED = 2.0  # logarithm of the share of combinations that a list's bounds are first hoped to leave out
 SURVIVORS = 64  # of a list, up to which it is worth to solve them
 KEPT = 4096  # sets of free moves whose radii are kept
+ROUNDS = 3  # batches of neighbours of an incumbent that are solved
 NEWEST = 64  # cuts that candidates are held against
 
 
@@ -108,7 +119,11 @@ class _Tree:
         self.next: _Node | None = None  # the child that is followed
         self.number = itertools.count()
         self.held = 0
-        self.list_up_to = np.log(LISTED)  # logarithm of the estimated size up to which a list is tried
+
+        self.list_up_to = (
+            np.log(LISTED) + HOPED
+        )  # logarithm of the estimated size up to which a list is tried
+        self.polished = np.inf  # value of the incumbent whose neighbours were solved
         self.radii_of: dict[bytes, np.ndarray] = {}
 
     # ---- open nodes
@@ -144,7 +159,7 @@ class _Tree:
                 continue
             if (yield from self._listed(reduced)):
                 continue
-            branchings = self._branchings(reduced)[: max((LANES - len(children)) // 2, 1)]
+            branchings = self._branchings(reduced)
             plan = [(branching, self._children(reduced, branching)) for branching in branchings]
             plans.append((reduced, plan))
             children += [child for _, pair in plan for child in pair]
@@ -154,6 +169,7 @@ class _Tree:
         for node, plan in plans:
             self._chosen(node, plan)
         yield from self._rounded(children)
+        yield from self._improved()
 
     def _relaxed(self, children: list[_Child]) -> Steps:
         """Relax the children whose limits leave anything, in one batch."""
@@ -226,8 +242,13 @@ class _Tree:
         cut = np.clip(np.floor(at), low, high - 1).astype(int)
         part = at - cut
         between = (high > low) & (part > FRACTION) & (part < 1.0 - FRACTION)
-        for chain in self.search.chains:  # the first position is the first move
-            between[count + chain.columns[0]] = False
+        for chain in self.search.chains:
+            moves, positions = chain.columns, count + chain.columns
+            between[positions[0]] = False  # the first position is the first move
+            if between[positions].any() and self._room(limits.low, limits.high, chain) <= self._room(
+                limits.lower, limits.upper, chain
+            ):
+                between[moves[1:]] = False  # a valve's few positions decide its many moves
         rows = np.flatnonzero(between)
         if not len(rows):
             return [self._halved(node)]
@@ -335,7 +356,8 @@ class _Tree:
         if not good[0]:
             return None
         (result, lane), model, start = child.solved, parent.model, parent.start
-        if np.isfinite(result.x[lane]).all() and np.isfinite(result.bound[lane]):
+        # a relaxation that did not get to its end may know less than its parent's prices, which hold here, too
+        if np.isfinite(result.x[lane]).all() and result.bound[lane] >= parent.model.value:
             model = self.search.lower_model(result, lane, child.limits.lower, child.limits.upper)
             model, start = self.priced(model, result, lane, child.limits), result.start(lane)
         return _Node(bound, tight.lane(0), model, start)
@@ -358,7 +380,7 @@ class _Tree:
         moves = np.array([result.x[lane, c.integer] for result, lane in solved])
         moves = np.unique(np.concatenate([np.round(moves), self._walked(moves)]), axis=0)
         moves = moves[np.isfinite(moves).all(axis=1)].astype(int)
-        low, high = (np.round(values[c.integer]).astype(int) for values in search.limits)
+        low, high = (whole(values[c.integer]) for values in search.limits)
         points = search.new(list(moves[satisfied(search.chains, moves, low, high)]))
         yield from self._solve_best(points)
 
@@ -382,6 +404,26 @@ class _Tree:
         best = best[bounds[best] < self.search.cutoff]
         if len(best):
             yield from self._solve(points[best])
+
+    def _improved(self) -> Steps:
+        """Solve the points around a new incumbent that may be better, until none is."""
+        search, integer = self.search, self.search.constants.integer
+        low, high = (whole(values[integer]) for values in search.limits)
+        while search.value < self.polished and not search.out_of_time():
+            self.polished = search.value
+            assert search.x is not None
+            points = search.new(list(around(search.chains, whole(search.x[integer]), low, high)))
+            for _ in range(ROUNDS):
+                if not len(points):
+                    break
+                bounds = self.cuts.bounds(points, max(len(self.cuts.list) - NEWEST, 0))
+                best = np.argsort(bounds, kind="stable")
+                best = best[bounds[best] < search.cutoff]
+                if len(best):
+                    yield from self._solve(points[best[:LANES]])
+                points = points[best[LANES:]]
+                if search.value < self.polished:
+                    break
 
     def _solve(self, points: np.ndarray, bounds: np.ndarray | None = None) -> Steps:
         """Solve whole moves, each for a cut and perhaps an incumbent."""
@@ -427,10 +469,16 @@ class _Tree:
             points, bounds = points[rest], bounds[rest]
 
     def _log_size(self, node: _Node) -> float:
-        """Logarithm of the whole moves in the node's level set, estimated by its box and by its volume."""
-        free = node.limits.upper > node.limits.lower
-        box = float(np.log((node.limits.upper - node.limits.lower + 1.0)[free]).sum())
-        return box
+        """Logarithm of the whole moves in the node's level set, estimated by its box."""
+        limits = node.limits
+        by_moves = [self._room(limits.lower, limits.upper, chain) for chain in self.search.chains]
+        by_positions = [self._room(limits.low, limits.high, chain) for chain in self.search.chains]
+        return sum(map(min, by_moves, by_positions))
+
+    @staticmethod
+    def _room(low: np.ndarray, high: np.ndarray, chain: Chain) -> float:
+        """Logarithm of the combinations of one MV's moves or positions within limits."""
+        return float(np.log(high[chain.columns] - low[chain.columns] + 1.0).sum())
 
 
 def _both(one: MoveLimits, other: MoveLimits) -> MoveLimits:

@@ -236,6 +236,17 @@ def satisfied(chains: list[Chain], moves: np.ndarray, lower: np.ndarray, upper: 
     return np.asarray(good)
 
 
+def around(chains: list[Chain], point: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """The point and the feasible points one or two steps away, ``"point integer"``."""
+    free = np.flatnonzero(upper > lower)
+    unit = np.eye(len(point), dtype=int)[free]
+    first, second = np.triu_indices(len(free), k=1)
+    pair = unit[first] - unit[second]  # a step moved from one block to another
+    steps = np.concatenate([0 * unit[:1], -unit, unit, -pair, pair])
+    array = point + steps if len(free) else point[None]
+    return array[satisfied(chains, array, lower, upper)]
+
+
 def nearest(
     chains: list[Chain], wanted: np.ndarray, lower: np.ndarray, upper: np.ndarray
 ) -> np.ndarray | None:

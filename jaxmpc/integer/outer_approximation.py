@@ -9,12 +9,10 @@ agree, and what it still proposes joins the list.
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 
 from jaxmpc.integer.cuts import Cuts
-from jaxmpc.integer.feasible import satisfied
+from jaxmpc.integer.feasible import around, satisfied
 from jaxmpc.integer.host_search import GROUP, Offload, Search, Steps
 from jaxmpc.integer.lower_bound import LowerModel, enumerate_below
 
@@ -69,7 +67,7 @@ def outer_approximation(
         search.nodes += 1
         if tangents.knows(point):
             master.forbid(point)  # rounding of the master: its value is known, only what is left matters
-        points = _around(search, point, lower, upper)
+        points = around(search.chains, point, lower, upper)
 
 
 class _Tangents:
@@ -157,21 +155,3 @@ def _solve_candidates(search: Search, cuts: Cuts, points: np.ndarray, limit: flo
         search.nodes += len(best)
         for lane, point in enumerate(best):
             cuts.add(result, lane, point, point)
-
-
-def _around(search: Search, point: np.ndarray, lower, upper) -> np.ndarray:
-    """The point and the feasible points one or two steps away."""
-    free = np.flatnonzero(upper > lower)
-    steps = [np.zeros_like(point)]
-    for i in free:
-        for step in (-1, 1):
-            other = np.zeros_like(point)
-            other[i] = step
-            steps.append(other)
-    for i, j in itertools.combinations(free, 2):  # a step moved from one block to another
-        for step in (-1, 1):
-            other = np.zeros_like(point)
-            other[i], other[j] = step, -step
-            steps.append(other)
-    array = point + np.array(steps)
-    return array[satisfied(search.chains, array, lower, upper)]
