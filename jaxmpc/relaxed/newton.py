@@ -48,6 +48,7 @@ DAMPING, MOST_DAMPING, DAMP = 1e-4, 10.0, 10.0  # on the diagonal after short st
 SEARCHES = 12  # trials of the line search
 FLAT = 0.3  # share of its slope at the start that the merit may have where a line search ends
 UPHILL = 1e-3  # the same for a merit that may be above that at the start
+INEXACT = 0.1  # of the root of the change of the prices, squared: a gradient below it is good enough to take them
 NOTHING = 0.01  # gradient without moves, and moves, below which there is next to nothing to gain
 SETTLED, EXACT = 1e-7, 1e-12  # share of the gradient without moves left when prices are taken, and at the end
 # 1e-10 ended a step of the thesis run too early
@@ -307,9 +308,10 @@ def refine(problem: Prepared, start: WarmStart) -> QpSolution:
         left = jnp.max(jnp.abs(proximal.gradient(point.x, prices)))
         # where there is next to nothing to gain, the gap has to be small against a small share of the unit
         at_play = NOTHING + largest + jnp.max(jnp.abs(point.x))
-        settled, exact = left < SETTLED * (1.0 + largest), left < EXACT * at_play
+        exact = left < EXACT * at_play
         gained = jax.tree.map(lambda new, old: new - old, prices, state.prices)
         change = sum(jnp.sum(g**2 / sigma) for g, sigma in zip(gained, proximal.sigma, strict=True))
+        settled = (left < SETTLED * (1.0 + largest)) | (left < INEXACT * jnp.sqrt(change))
         worth = jax.tree.map(lambda gain, new: jnp.abs(gain * new), gained, prices)
         owed = sum(jnp.sum(w / sigma) for w, sigma in zip(worth, proximal.sigma, strict=True))
         outside = jnp.max(jnp.abs(gained.hard) / proximal.sigma.hard, initial=0.0)
