@@ -27,7 +27,7 @@ from jaxmpc.integer.feasible import (
     within,
 )
 from jaxmpc.integer.host_search import Search, Steps
-from jaxmpc.integer.lower_bound import LowerModel, PositionPrices, enumerate_below, exclude, radii
+from jaxmpc.integer.lower_bound import LowerModel, enumerate_below, exclude, radii
 from jaxmpc.integer.relaxer import LANES, Relaxations
 from jaxmpc.relaxed.newton import WarmStart
 
@@ -92,7 +92,7 @@ def branch_and_bound(
     """
     tree = _Tree(search, cuts)
     limits = MoveLimits(lower, upper, *position_limits(search.chains))
-    tree.keep(_Node(root_bound, limits, tree.priced(model, root, 0, limits), root.start(0)))
+    tree.keep(_Node(root_bound, limits, model, root.start(0)))
     while True:
         least = tree.least
         if least >= search.cutoff:
@@ -190,11 +190,6 @@ class _Tree:
             search.offer(result, lane)
 
     # ---- what a relaxed node proves
-    def priced(self, model: LowerModel, result: Relaxations, lane: int, limits: MoveLimits) -> LowerModel:
-        """The lower model with the prices of the position rows of the same solve, which had these limits."""
-        price = result.warm.hard_price[lane][self.search.position_rows]
-        return dataclasses.replace(model, positions=PositionPrices(price, limits.low, limits.high))
-
     def _radii(self, model: LowerModel) -> np.ndarray:
         """`lower_bound.radii` of moves and positions, with the moves held that the node was solved with fixed."""
         free = model.upper > model.lower
@@ -359,7 +354,8 @@ class _Tree:
         # a relaxation that did not get to its end may know less than its parent's prices, which hold here, too
         if np.isfinite(result.x[lane]).all() and result.bound[lane] >= parent.model.value:
             model = self.search.lower_model(result, lane, child.limits.lower, child.limits.upper)
-            model, start = self.priced(model, result, lane, child.limits), result.start(lane)
+            model = model.priced(result.warm.hard_price[lane][self.search.position_rows], child.limits)
+            start = result.start(lane)
         return _Node(bound, tight.lane(0), model, start)
 
     def _learn(self, node: _Node, branching: _Branching, side: int, bound: float) -> None:

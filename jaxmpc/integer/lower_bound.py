@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxmpc.integer.feasible import Chain, satisfied
+from jaxmpc.integer.feasible import Chain, MoveLimits, satisfied
 
 GRID = 1024  # combinations up to which all are evaluated at once
 CELLS = 2**24  # partial assignments times values of the next move that are looked at together
@@ -68,6 +68,10 @@ class LowerModel:
     order: Int[np.ndarray, " integer"]
     leading: Float[np.ndarray, "integer integer"]
     positions: PositionPrices | None = None
+
+    def priced(self, price: np.ndarray, limits: MoveLimits) -> LowerModel:
+        """With the prices of the position rows of the same solve, which had these limits."""
+        return dataclasses.replace(self, positions=PositionPrices(price, limits.low, limits.high))
 
 
 def schur_complement(hessian: np.ndarray, integer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxmpc.integer.branch_and_bound import branch_and_bound
 from jaxmpc.integer.cuts import Cuts
 from jaxmpc.integer.enumeration import enumerate_all
-from jaxmpc.integer.feasible import UndecidedError, propagate, satisfied, whole
+from jaxmpc.integer.feasible import MoveLimits, UndecidedError, position_limits, propagate, satisfied, whole
 from jaxmpc.integer.host_search import GROUP, Search, SearchResult, Steps
 from jaxmpc.integer.lower_bound import LowerModel, enumerate_below, exclude
 from jaxmpc.integer.outer_approximation import outer_approximation
@@ -103,6 +103,8 @@ def _line(search: Search, starts: Sequence[np.ndarray], finish: str, last: bool)
     if not (np.isfinite(root.x).all() and np.isfinite(root.bound).all()):
         return search.finish(None, root_bound)
     model, lower, upper = search.lower_model(root, 0, low, high), low, high
+    own = MoveLimits(low, high, *position_limits(search.chains))
+    model = model.priced(root.warm.hard_price[0][search.position_rows], own)
     point = np.clip(whole(model.center), low, high)
     if not satisfied(search.chains, point[None], low, high)[0]:
         lower, upper, possible = (part[0] for part in propagate(search.chains, low[None], high[None]))

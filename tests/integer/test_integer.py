@@ -10,7 +10,7 @@ from jaxmpc import status
 from jaxmpc.integer import listing as compiled_lists
 from jaxmpc.integer import search as compiled_search
 from jaxmpc.integer.cuts import Cuts
-from jaxmpc.integer.feasible import Chain, MoveLimits, nearest, propagate, satisfied, tighten, within
+from jaxmpc.integer.feasible import Chain, MoveLimits, nearest, needed, propagate, satisfied, tighten, within
 from jaxmpc.integer.host_search import Search
 from jaxmpc.integer.lower_bound import enumerate_below, exclude
 from jaxmpc.integer.relaxer import Relaxer
@@ -67,7 +67,7 @@ def test_propagation_keeps_every_feasible_move_and_the_dynamic_programme_finds_t
 def test_propagation_with_positions_of_each_lane_keeps_every_feasible_move_and_position():
     rng = np.random.default_rng(3)
     moves = np.array(list(itertools.product(range(-2, 3), repeat=4)))
-    lanes, feasible_seen, infeasible_seen = 10, 0, 0
+    lanes, feasible_seen, infeasible_seen, dropped = 10, 0, 0, 0
     for _ in range(60):
         chain = random_chain(rng)
         reached = np.cumsum(moves * chain.counts, axis=1)
@@ -76,9 +76,15 @@ def test_propagation_with_positions_of_each_lane_keeps_every_feasible_move_and_p
         high = np.minimum(chain.high, low + rng.integers(1, 6, size=(lanes, 4)))
         given = MoveLimits(lower, upper, low, high)
         tight, possible = tighten([chain], given)
+        rest = tight._replace(**dict(zip(("low", "high"), needed([chain], tight), strict=True)))
         for k in range(lanes):
             own = given.lane(k)
             good = satisfied(within([chain], own), moves, own.lower, own.upper)
+            if possible[k]:  # what follows from other limits may be left out
+                left = rest.lane(k)
+                same = satisfied(within([chain], left), moves, left.lower, left.upper)
+                np.testing.assert_array_equal(good, same)
+                dropped += int((left.low < own.low).sum())
             if good.any():
                 assert possible[k]
                 for values, least, most in ((moves, 0, 1), (reached, 2, 3)):
@@ -88,6 +94,7 @@ def test_propagation_with_positions_of_each_lane_keeps_every_feasible_move_and_p
             else:
                 infeasible_seen += 1
     assert min(feasible_seen, infeasible_seen) > 50
+    assert dropped > 100
 
 
 def one(tree):
