@@ -20,17 +20,11 @@ Plan = np.ndarray | None
 
 
 class Asked(NamedTuple):
-    """What a peer answered.
+    """What a peer answered."""
 
-    Attributes:
-        at: positions of the problems that it was asked.
-        seconds: ``"problem"``, of its own work.
-        answers: one per problem.
-    """
-
-    at: np.ndarray
-    seconds: np.ndarray
-    answers: list[PeerAnswer]
+    at: np.ndarray  # positions of the problems that it was asked
+    seconds: np.ndarray  # "problem", of its own work
+    answers: list[PeerAnswer]  # one per problem
 
 
 class Contest:

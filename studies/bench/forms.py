@@ -22,28 +22,18 @@ class Form:
     """min z'Pz / 2 + c'z, row_low <= A z <= row_high, low <= z <= high, some z integer.
 
     Every variable is divided by a unit that keeps its size near one.
-
-    Attributes:
-        P: Hessian, sparse by columns ``"variable variable"``.
-        c: linear cost.
-        A: rows, sparse by rows ``"row variable"``.
-        row_low, row_high: their limits, equal for equations.
-        low, high: limits of the variables, infinite for none.
-        starts: ``"block mv"``, where the moves of a plan are.
-        units: of the moves, ``"mv"`` [MV unit].
-        integer: ``"mv"``, whether the MV makes whole moves.
     """
 
-    P: Any
-    c: np.ndarray
-    A: Any
-    row_low: np.ndarray
-    row_high: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    starts: np.ndarray
-    units: np.ndarray
-    integer: np.ndarray
+    P: Any  # Hessian, sparse by columns "variable variable"
+    c: np.ndarray  # linear cost
+    A: Any  # rows, sparse by rows "row variable"
+    row_low: np.ndarray  # their limits, equal for equations
+    row_high: np.ndarray  # their limits, equal for equations
+    low: np.ndarray  # limits of the variables, infinite for none
+    high: np.ndarray  # limits of the variables, infinite for none
+    starts: np.ndarray  # "block mv", where the moves of a plan are
+    units: np.ndarray  # of the moves, "mv" [MV unit]
+    integer: np.ndarray  # "mv", whether the MV makes whole moves
 
     def scaled(self) -> Form:
         """The same problem with its cost divided by the largest entry of P, for solvers with absolute tolerances."""

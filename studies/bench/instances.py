@@ -43,25 +43,16 @@ FIELDS = ("setpoint", "cv", "move", "mv_demand", "gap", "fallback", "solve_time"
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """What a closed-loop run leaves for the benchmark, time first.
+    """What a closed-loop run leaves for the benchmark, time first."""
 
-    Attributes:
-        setpoint, cv: ``"sample cv"`` [CV unit].
-        move, mv_demand: ``"sample mv"`` [MV unit].
-        gap: ``"sample"``, relative gap of the plan.
-        fallback: ``"sample"``, whether there was no plan.
-        solve_time: ``"sample"`` [s].
-        wall_time: of the run, plant included, first compilation not [s].
-    """
-
-    setpoint: np.ndarray
-    cv: np.ndarray
-    move: np.ndarray
-    mv_demand: np.ndarray
-    gap: np.ndarray
-    fallback: np.ndarray
-    solve_time: np.ndarray
-    wall_time: float
+    setpoint: np.ndarray  # "sample cv" [CV unit]
+    cv: np.ndarray  # "sample cv" [CV unit]
+    move: np.ndarray  # "sample mv" [MV unit]
+    mv_demand: np.ndarray  # "sample mv" [MV unit]
+    gap: np.ndarray  # "sample", relative gap of the plan
+    fallback: np.ndarray  # "sample", whether there was no plan
+    solve_time: np.ndarray  # "sample" [s]
+    wall_time: float  # of the run, plant included, first compilation not [s]
 
 
 class Problems(NamedTuple):
@@ -84,20 +75,14 @@ class Problems(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Instances:
-    """Recorded problems with those of the sample before, which a warm start comes from.
+    """Recorded problems with those of the sample before, which a warm start comes from."""
 
-    Attributes:
-        structure, tuning, model: of the controller.
-        sample: ``"problem"``, where in the run they are.
-        now, before: the problems, and those one sample earlier.
-    """
-
-    structure: Structure
-    tuning: Tuning
-    model: StepResponseModel
-    sample: np.ndarray
-    now: Problems
-    before: Problems
+    structure: Structure  # of the controller
+    tuning: Tuning  # of the controller
+    model: StepResponseModel  # of the controller
+    sample: np.ndarray  # "problem", where in the run they are
+    now: Problems  # the problems, and those one sample earlier
+    before: Problems  # the problems, and those one sample earlier
 
     def __len__(self) -> int:
         return len(self.sample)

@@ -28,19 +28,12 @@ HUGE = 1e30  # what solvers without infinity call infinite
 
 @dataclasses.dataclass
 class PeerAnswer:
-    """What a peer found.
+    """What a peer found."""
 
-    Attributes:
-        status: ``optimal``, ``limit``, ``infeasible`` or ``failed``.
-        z: variables of the form, None without a point.
-        bound: the solver's own lower bound of the cost without constants.
-        seconds: what its own work took [s].
-    """
-
-    status: str
-    z: np.ndarray | None = None
-    bound: float = -math.inf
-    seconds: float = math.nan
+    status: str  # optimal, limit, infeasible or failed
+    z: np.ndarray | None = None  # variables of the form, None without a point
+    bound: float = -math.inf  # the solver's own lower bound of the cost without constants
+    seconds: float = math.nan  # what its own work took [s]
 
 
 Solve = Callable[[Form], PeerAnswer]
@@ -48,27 +41,17 @@ Solve = Callable[[Form], PeerAnswer]
 
 @dataclasses.dataclass(frozen=True)
 class Peer:
-    """A solver that the benchmark compares with.
+    """A solver that the benchmark compares with."""
 
-    Attributes:
-        name: as printed.
-        package: distribution on the package index that brings it, imported under the same name.
-        build: the form it is fastest with.
-        begin: ``(tolerance, seconds per solve) -> solve``; keeps what it may keep between samples.
-        timed: what its time covers, for the table.
-        keeps: whether it is set up once for samples with equal matrices.
-        limit: samples it is asked at most, because it is slow.
-        hopeless: seconds after which one solve is cut off.
-    """
-
-    name: str
-    package: str
-    build: Callable[[dict], Form]
+    name: str  # as printed
+    package: str  # distribution on the package index that brings it, imported under the same name
+    build: Callable[[dict], Form]  # the form it is fastest with
+    # (tolerance, seconds per solve) -> solve; keeps what it may keep between samples
     begin: Callable[[float, float], Solve]
-    timed: str
-    keeps: bool = False
-    limit: int = 10_000
-    hopeless: float = 10.0
+    timed: str  # what its time covers, for the table
+    keeps: bool = False  # whether it is set up once for samples with equal matrices
+    limit: int = 10_000  # samples it is asked at most, because it is slow
+    hopeless: float = 10.0  # seconds after which one solve is cut off
 
     def missing(self) -> str | None:
         """Why it cannot be used, None if it can."""

@@ -39,17 +39,11 @@ _LARGER_IS_BETTER = ("rate", "ratio")
 
 
 class Goal(msgspec.Struct, frozen=True):
-    """What a row must reach.
+    """What a row must reach."""
 
-    Attributes:
-        quantity: field of the row.
-        floor: that must be reached.
-        aim: beyond the floor, None for none.
-    """
-
-    quantity: Quantity
-    floor: float
-    aim: float | None = None
+    quantity: Quantity  # field of the row
+    floor: float  # that must be reached
+    aim: float | None = None  # beyond the floor, None for none
 
     def met(self, row: Row) -> bool | None:
         """Whether the row reaches the floor with solutions that count; None where that is not known."""
@@ -64,44 +58,27 @@ class Goal(msgspec.Struct, frozen=True):
 
 
 class Row(msgspec.Struct, kw_only=True):
-    """One line of the benchmark.
+    """One line of the benchmark."""
 
-    Attributes:
-        name: what was measured.
-        section: that it belongs to.
-        status: ``measured``, ``missing`` (a peer that is not installed), ``failed`` or ``not measured``.
-        instances: problems that were tried, or samples of a run.
-        solved: how many of them have a solution that counts.
-        median_ms, p99_ms: time per problem [ms].
-        rate: problems per second.
-        seconds: of the whole, where that is what matters [s].
-        megabytes: peak memory of the process [MB].
-        ratio: how many times as fast as `ratio_to` on the problems that both were given.
-        ratio_to: the peer.
-        ratio_is_lower_bound: the peer was stopped at its time limit.
-        worst_error: largest error of the solutions, see `judge.error`; None where there are none.
-        counts: whether no solution is wrong by more than `RIGHT`.
-        goals: floors and aims.
-        note: how it was measured.
-    """
-
-    name: str
-    section: str
+    name: str  # what was measured
+    section: str  # that it belongs to
+    # measured, missing (a peer that is not installed), failed or not measured
     status: Literal["measured", "missing", "failed", "not measured"] = "measured"
-    instances: int | None = None
-    solved: int | None = None
-    median_ms: float | None = None
-    p99_ms: float | None = None
-    rate: float | None = None
-    seconds: float | None = None
-    megabytes: float | None = None
-    ratio: float | None = None
-    ratio_to: str | None = None
-    ratio_is_lower_bound: bool = False
+    instances: int | None = None  # problems that were tried, or samples of a run
+    solved: int | None = None  # how many of them have a solution that counts
+    median_ms: float | None = None  # time per problem [ms]
+    p99_ms: float | None = None  # time per problem [ms]
+    rate: float | None = None  # problems per second
+    seconds: float | None = None  # of the whole, where that is what matters [s]
+    megabytes: float | None = None  # peak memory of the process [MB]
+    ratio: float | None = None  # how many times as fast as `ratio_to` on the problems that both were given
+    ratio_to: str | None = None  # the peer
+    ratio_is_lower_bound: bool = False  # the peer was stopped at its time limit
+    # largest error of the solutions, see `judge.error`; None where there are none
     worst_error: float | None = None
-    counts: bool = True
-    goals: tuple[Goal, ...] = ()
-    note: str = ""
+    counts: bool = True  # whether no solution is wrong by more than `RIGHT`
+    goals: tuple[Goal, ...] = ()  # floors and aims
+    note: str = ""  # how it was measured
 
 
 def timed(name: str, section: str, times: Sequence[float] | np.ndarray, errors: Any, **more: Any) -> Row:
@@ -141,22 +118,14 @@ def whole(name: str, section: str, seconds: float, errors: Any, **more: Any) -> 
 
 
 class Report(msgspec.Struct, kw_only=True):
-    """Everything one call of the benchmark measured; the content of its JSON file.
+    """Everything one call of the benchmark measured; the content of its JSON file."""
 
-    Attributes:
-        format: of this file.
-        machine: cores, load, versions, devices.
-        options: of the call.
-        complete: False while it runs and after an interrupt.
-        rows: measured so far.
-        series: numbers over a run or over batch sizes, by name, for figures.
-    """
-
-    format: int = FORMAT
-    machine: dict[str, Any] = {}
-    options: dict[str, Any] = {}
-    complete: bool = False
-    rows: list[Row] = []
+    format: int = FORMAT  # of this file
+    machine: dict[str, Any] = {}  # cores, load, versions, devices
+    options: dict[str, Any] = {}  # of the call
+    complete: bool = False  # False while it runs and after an interrupt
+    rows: list[Row] = []  # measured so far
+    # numbers over a run or over batch sizes, by name, for figures
     series: dict[str, dict[str, list[float]]] = {}
 
     def to_json(self) -> str:

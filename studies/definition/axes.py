@@ -31,23 +31,15 @@ EDGE = 1e-12  # a draw of exactly 0 or 1 would be infinitely far out in a normal
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Entries:
-    """The entries of one axis.
+    """The entries of one axis."""
 
-    Attributes:
-        place: path of the axis in the definition, for errors.
-        fields: of its keys; more than one in a linked axis.
-        labels: of its keys.
-        values: per key, one value per entry, in plain types.
-        paths: path of every entry's value, per key; one shared path where the entries are computed.
-        drawn: whether the entries are draws: all drawn axes take their entries together.
-    """
-
-    place: str
-    fields: tuple[Field, ...]
-    labels: tuple[str, ...]
-    values: tuple[list[Any], ...]
+    place: str  # path of the axis in the definition, for errors
+    fields: tuple[Field, ...]  # of its keys; more than one in a linked axis
+    labels: tuple[str, ...]  # of its keys
+    values: tuple[list[Any], ...]  # per key, one value per entry, in plain types
+    # path of every entry's value, per key; one shared path where the entries are computed
     paths: tuple[list[str] | str, ...]
-    drawn: bool = False
+    drawn: bool = False  # whether the entries are draws: all drawn axes take their entries together
 
     def __len__(self) -> int:
         return len(self.values[0])
@@ -60,15 +52,10 @@ class Entries:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class AxisTable:
-    """All scenarios as entry numbers.
+    """All scenarios as entry numbers."""
 
-    Attributes:
-        axes: the axes, in the order of the definition.
-        index: ``"scenario axis"``, which entry of each axis a scenario takes.
-    """
-
-    axes: tuple[Entries, ...]
-    index: np.ndarray
+    axes: tuple[Entries, ...]  # the axes, in the order of the definition
+    index: np.ndarray  # "scenario axis", which entry of each axis a scenario takes
 
     def __len__(self) -> int:
         return len(self.index)

@@ -32,17 +32,11 @@ def chunk_seconds(kind: str, samples: int, lanes: int) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Work:
-    """The chunks of a study and what the table expects of them.
+    """The chunks of a study and what the table expects of them."""
 
-    Attributes:
-        groups: index of the group of every chunk.
-        kinds: kind of controller of every group.
-        seconds: `chunk_seconds` of every group [s].
-    """
-
-    groups: Sequence[int]
-    kinds: Sequence[str]
-    seconds: Sequence[float]
+    groups: Sequence[int]  # index of the group of every chunk
+    kinds: Sequence[str]  # kind of controller of every group
+    seconds: Sequence[float]  # `chunk_seconds` of every group [s]
 
     def costs(self, done: Mapping[int, Mapping[str, Any]]) -> list[float]:
         """Seconds that one worker needs for a chunk of each group, without compilation.
@@ -99,31 +93,18 @@ def _mean(pairs: Iterable[tuple[Any, float]], expected: float) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Description:
-    """What a run would do; see `scenarios.Study.describe`.
+    """What a run would do; see `scenarios.Study.describe`."""
 
-    Attributes:
-        name: of the study.
-        scenarios: how many.
-        group_sizes: scenarios of every group.
-        chunks: how many.
-        compilations: compiled programs, one per group.
-        models: step-response models to identify.
-        samples: samples of all scenarios together.
-        stored_bytes: key figures and trajectories before compression [B].
-        seconds: rough time on 2 CPU cores [s]: identification, and what the table says of the chunks.
-        searched: whether each chunk is a batch that is asked for after the one before.
-    """
-
-    name: str
-    scenarios: int
-    group_sizes: tuple[int, ...]
-    chunks: int
-    compilations: int
-    models: int
-    samples: int
-    stored_bytes: int
-    seconds: float
-    searched: bool = False
+    name: str  # of the study
+    scenarios: int  # how many
+    group_sizes: tuple[int, ...]  # scenarios of every group
+    chunks: int  # how many
+    compilations: int  # compiled programs, one per group
+    models: int  # step-response models to identify
+    samples: int  # samples of all scenarios together
+    stored_bytes: int  # key figures and trajectories before compression [B]
+    seconds: float  # rough time on 2 CPU cores [s]: identification, and what the table says of the chunks
+    searched: bool = False  # whether each chunk is a batch that is asked for after the one before
 
     def __str__(self) -> str:
         sizes = ", ".join(str(size) for size in self.group_sizes[:12])

@@ -27,30 +27,18 @@ Kind = Literal["number", "whole", "flag", "text", "lengths"]
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """One key.
+    """One key."""
 
-    Attributes:
-        key: its path below ``[base]``.
-        label: what it is, for legends and tables.
-        unit: of a number ("1" without unit, "" for what is not a number).
-        kind: ``number``, ``whole`` number, ``flag`` (true or false), ``text``, or ``lengths`` (of blocks).
-        default: what holds where nothing is given; None where another key or the preset decides.
-        choices: the texts that are accepted, where there are few.
-        shape: whether it fixes the shape of the compiled program.
-        infinite: whether infinity is accepted, as a limit that does not bind.
-        low, high: accepted range, as far as it does not follow from the typed objects.
-    """
-
-    key: str
-    label: str
-    unit: str
-    kind: Kind = "number"
-    default: Any = None
-    choices: tuple[str, ...] = ()
-    shape: bool = False
-    infinite: bool = False
-    low: float = -math.inf
-    high: float = math.inf
+    key: str  # its path below [base]
+    label: str  # what it is, for legends and tables
+    unit: str  # of a number ("1" without unit, "" for what is not a number)
+    kind: Kind = "number"  # number, whole number, flag (true or false), text, or lengths (of blocks)
+    default: Any = None  # what holds where nothing is given; None where another key or the preset decides
+    choices: tuple[str, ...] = ()  # the texts that are accepted, where there are few
+    shape: bool = False  # whether it fixes the shape of the compiled program
+    infinite: bool = False  # whether infinity is accepted, as a limit that does not bind
+    low: float = -math.inf  # accepted range, as far as it does not follow from the typed objects
+    high: float = math.inf  # accepted range, as far as it does not follow from the typed objects
 
     @property
     def numeric(self) -> bool:

@@ -36,52 +36,33 @@ LONGEST_RUN = 1_000_000  # samples
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Variant:
-    """What fixes shapes and setpoints, shared by all scenarios that agree in it.
+    """What fixes shapes and setpoints, shared by all scenarios that agree in it."""
 
-    Attributes:
-        kind: ``continuous`` or ``mixed-integer``.
-        actuator: ``continuous`` or ``step``.
-        structure: of the controller.
-        reference: setpoints, cut to the length of the run.
-        samples: length of the run [samples].
-    """
-
-    kind: str
-    actuator: str
-    structure: Structure
-    reference: Reference
-    samples: int
+    kind: str  # continuous or mixed-integer
+    actuator: str  # continuous or step
+    structure: Structure  # of the controller
+    reference: Reference  # setpoints, cut to the length of the run
+    samples: int  # length of the run [samples]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Inputs:
-    """All scenarios in the units of `jaxmpc`; an array that does not vary has one row for all.
+    """All scenarios in the units of `jaxmpc`; an array that does not vary has one row for all."""
 
-    Attributes:
-        variants: distinct shapes.
-        variant: ``"scenario"``, which of them.
-        tuning: per field of `jaxmpc.problem.tuning.Tuning` ``"scenario name"``, and ``"scenario"`` for the bias cut-off.
-        plant: per field of `jaxmpc.process.well.equations.WellParameters` ``"scenario"``, SI units.
-        point: ``"scenario 2"``, working point of the model: choke [%], gas lift [m3/h].
-        noise: ``"scenario cv"``, standard deviation [CV unit].
-        seed: ``"scenario"``, of the noise.
-        pressure: ``"scenario step 2"``, steps of the reservoir pressure: time [s], offset from then on [bar].
-        fault_kinds: CV and kind of every sensor fault.
-        faults: ``"scenario fault 3"``, time [s], duration [s] and size [CV unit] of the sensor faults.
-        told: ``"scenario"``, whether the controller is told where the actuators stand.
-    """
-
-    variants: tuple[Variant, ...]
-    variant: np.ndarray
+    variants: tuple[Variant, ...]  # distinct shapes
+    variant: np.ndarray  # "scenario", which of them
+    # per field of `jaxmpc.problem.tuning.Tuning` "scenario name", and "scenario" for the bias cut-off
     tuning: dict[str, np.ndarray]
+    # per field of `jaxmpc.process.well.equations.WellParameters` "scenario", SI units
     plant: dict[str, np.ndarray]
-    point: np.ndarray
-    noise: np.ndarray
-    seed: np.ndarray
+    point: np.ndarray  # "scenario 2", working point of the model: choke [%], gas lift [m3/h]
+    noise: np.ndarray  # "scenario cv", standard deviation [CV unit]
+    seed: np.ndarray  # "scenario", of the noise
+    # "scenario step 2", steps of the reservoir pressure: time [s], offset from then on [bar]
     pressure: np.ndarray
-    fault_kinds: tuple[tuple[str, str], ...]
-    faults: np.ndarray
-    told: np.ndarray
+    fault_kinds: tuple[tuple[str, str], ...]  # CV and kind of every sensor fault
+    faults: np.ndarray  # "scenario fault 3", time [s], duration [s] and size [CV unit] of the sensor faults
+    told: np.ndarray  # "scenario", whether the controller is told where the actuators stand
 
 
 def row(array: np.ndarray, k: int) -> np.ndarray:

@@ -42,30 +42,22 @@ T = TypeVar("T")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StudyDefinition:
-    """A sweep study as written, every section decoded.
+    """A sweep study as written, every section decoded."""
 
-    Attributes:
-        study, axes, sampling, store, quick: the sections of the file.
-        search: what is sought along the axes; None for a study that lists its scenarios.
-        base: settings by key (`fields.FIELDS`), only those that are given; besides, ``reference`` may be an
-            `ReferenceDefinition`, ``disturbance`` is a tuple of `PressureStep` and ``sensor_fault`` one of `FaultSection`.
-        places: path of every axis in the file, for errors.
-        folder: that CSV files are relative to.
-        body: content of the file, from which `from_dict` makes the same definition again.
-        is_cut: whether this is the quick version of it.
-    """
-
-    study: StudySection
+    study: StudySection  # the sections of the file
+    # settings by key (`fields.FIELDS`), only those that are given; besides, reference may be an
+    # `ReferenceDefinition`, disturbance is a tuple of `PressureStep` and sensor_fault one of `FaultSection`
     base: dict[str, Any]
-    axes: tuple[Axis, ...]
-    sampling: Sampling
-    store: Store
-    quick: Quick | None
-    places: tuple[str, ...]
-    folder: str = "."
+    axes: tuple[Axis, ...]  # the sections of the file
+    sampling: Sampling  # the sections of the file
+    store: Store  # the sections of the file
+    quick: Quick | None  # the sections of the file
+    places: tuple[str, ...]  # path of every axis in the file, for errors
+    folder: str = "."  # that CSV files are relative to
+    # content of the file, from which `from_dict` makes the same definition again
     body: dict[str, Any] = dataclasses.field(default_factory=dict)
-    is_cut: bool = False
-    search: Search | None = None
+    is_cut: bool = False  # whether this is the quick version of it
+    search: Search | None = None  # what is sought along the axes; None for a study that lists its scenarios
 
     @classmethod
     def from_dict(cls, body: dict[str, Any], folder: str | Path = ".") -> StudyDefinition:

@@ -35,15 +35,10 @@ class Row:
 
 @dataclasses.dataclass(frozen=True)
 class IntegerProgram:
-    """Maximise ``objective . x`` over the integer points that satisfy every row.
+    """Maximise ``objective . x`` over the integer points that satisfy every row."""
 
-    Attributes:
-        objective: coefficients of the two variables.
-        rows: they must enclose a bounded set, the signs of the variables included.
-    """
-
-    objective: Point
-    rows: tuple[Row, ...]
+    objective: Point  # coefficients of the two variables
+    rows: tuple[Row, ...]  # they must enclose a bounded set, the signs of the variables included
 
     def value(self, point: Point) -> Fraction:
         """Objective at a point."""
@@ -56,19 +51,13 @@ class IntegerProgram:
 
 @dataclasses.dataclass(frozen=True)
 class Cut:
-    """A valid inequality and why it is one.
+    """A valid inequality and why it is one."""
 
-    Attributes:
-        row: the inequality, with coprime integer coefficients.
-        optimum: optimum of the relaxation once the row is added.
-        rows: the rows of the problem that it is combined from.
-        multipliers: of these rows: the combination has the cut's left side, and its right side rounded down is the
-            cut's limit (a Chvatal-Gomory cut).
-    """
-
-    row: Row
-    optimum: Point
-    rows: tuple[Row, ...]
+    row: Row  # the inequality, with coprime integer coefficients
+    optimum: Point  # optimum of the relaxation once the row is added
+    rows: tuple[Row, ...]  # the rows of the problem that it is combined from
+    # of these rows: the combination has the cut's left side, and its right side rounded down is the cut's
+    # limit (a Chvatal-Gomory cut)
     multipliers: tuple[Fraction, ...]
 
 

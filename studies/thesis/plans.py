@@ -22,21 +22,13 @@ LONGEST_SWING = 1000.0  # s
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StoredPlan:
-    """What a controller planned at one time.
+    """What a controller planned at one time."""
 
-    Attributes:
-        time: when the plan was made [s].
-        move: ``"sample mv"``, planned moves of the Hu samples, row 0 the move made at `time` [MV unit].
-        mv: ``"sample mv"``, the MVs after each of these moves [MV unit].
-        cv: ``"horizon cv"``, predicted CVs at 1..Hp samples after `time` [CV unit].
-        dt: sampling interval [s].
-    """
-
-    time: float
-    move: np.ndarray
-    mv: np.ndarray
-    cv: np.ndarray
-    dt: float
+    time: float  # when the plan was made [s]
+    move: np.ndarray  # "sample mv", planned moves of the Hu samples, row 0 the move made at `time` [MV unit]
+    mv: np.ndarray  # "sample mv", the MVs after each of these moves [MV unit]
+    cv: np.ndarray  # "horizon cv", predicted CVs at 1..Hp samples after `time` [CV unit]
+    dt: float  # sampling interval [s]
 
     @property
     def move_time(self) -> np.ndarray:

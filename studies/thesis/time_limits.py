@@ -21,18 +21,12 @@ from studies.definition.comparison import ControllerDefinition
 
 
 class LimitedSteps(NamedTuple):
-    """The steps of a run that ended at their time limit.
+    """The steps of a run that ended at their time limit."""
 
-    Attributes:
-        label: of the controller.
-        share: of all steps, 0..1.
-        gap: median of the relative gaps that were proven.
-        lost: relative to the exact optimum of the same step, the median, the 90th percentile and the most.
-    """
-
-    label: str
-    share: float
-    gap: float
+    label: str  # of the controller
+    share: float  # of all steps, 0..1
+    gap: float  # median of the relative gaps that were proven
+    # relative to the exact optimum of the same step, the median, the 90th percentile and the most
     lost: tuple[float, float, float]
 
 
