@@ -28,9 +28,9 @@ class Form:
     c: np.ndarray  # linear cost
     A: Any  # rows, sparse by rows "row variable"
     row_low: np.ndarray  # their limits, equal for equations
-    row_high: np.ndarray  # their limits, equal for equations
+    row_high: np.ndarray
     low: np.ndarray  # limits of the variables, infinite for none
-    high: np.ndarray  # limits of the variables, infinite for none
+    high: np.ndarray
     starts: np.ndarray  # "block mv", where the moves of a plan are
     units: np.ndarray  # of the moves, "mv" [MV unit]
     integer: np.ndarray  # "mv", whether the MV makes whole moves

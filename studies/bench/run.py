@@ -107,6 +107,7 @@ def _section(name: str, context: Context, report: Report) -> bool:
     """Append the rows of a section; an error ends it with a row that says so. True if it came to its end."""
     try:
         for row in SECTIONS[name](context):
+            row.section = name
             report.rows.append(row)
     except Exception as error:  # one section must not cost the others their rows
         what = " ".join(f"{type(error).__name__}: {error}".split())

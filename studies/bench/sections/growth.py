@@ -14,7 +14,7 @@ from studies.bench.context import Context
 from studies.bench.instances import Instances, Problems
 from studies.bench.judge import Judge
 from studies.bench.lanes import Lanes
-from studies.bench.rows import Row, batched
+from studies.bench.rows import Row, whole
 from studies.bench.sections.relaxed import TOLERANCE, batch_times
 
 LANES = 32
@@ -38,7 +38,7 @@ def growth(context: Context) -> Iterator[Row]:
                 judge.hear(peer.name, plans)
                 ratio = float(theirs.sum()) / seconds
             name, errors, to = f"growth, {axis} {size}", judge.errors("jaxmpc"), f"{peer.name} (one core)"
-            yield batched(name, "growth", seconds, LANES, errors, ratio=ratio, ratio_to=to, note=note)
+            yield whole(name, seconds, errors, LANES, ratio=ratio, ratio_to=to, note=note)
 
 
 def random_instances(rng: np.random.Generator, shape: dict[str, int], lanes: int) -> Instances:

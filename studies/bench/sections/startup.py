@@ -47,7 +47,6 @@ def startup(context: Context) -> Iterator[Row]:
                 judge.hear(call, [plan])
                 yield whole(
                     f"{call} call, {mode}",
-                    "startup",
                     seconds,
                     judge.errors(call),
                     goals=(Goal("seconds", 30.0, 8.0),) if call == "first" else (),
