@@ -10,6 +10,7 @@ from identify.step_test import identify_step_response
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.plant import check_inputs, steady_state
+from studies.definition.refusing import require
 
 Point = tuple[float, float]
 STEPS = (2.0, 100.0)  # of the choke [%] and of the gas lift [m3/h]
@@ -42,11 +43,10 @@ def identify_models(
             check_inputs(choke, lift)
             check_inputs(choke + STEPS[0], lift + STEPS[1])
         except InputError as error:
-            raise InputError(
-                here, error.value, f"{error.expected}, also {STEPS[0]:g} % and {STEPS[1]:g} m3/h further"
-            ) from None
-        if not bool(_steady_state(choke, lift).converged):
-            raise InputError(here, "no steady state", "a working point at which the well settles")
+            expected = f"{error.expected}, also {STEPS[0]:g} % and {STEPS[1]:g} m3/h further"
+            raise InputError(here, error.value, expected) from None
+        settles = _steady_state(choke, lift).converged
+        require(settles, here, "no steady state", "a working point at which the well settles")
     out = {}
     for choke, lift in wanted:
         out[choke, lift] = identify_step_response(None, choke, lift, STEPS, samples)

@@ -11,10 +11,10 @@ from __future__ import annotations
 import copy
 from typing import Any, Literal
 
-from jaxmpc.errors import InputError
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning, make_tuning
 from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS
+from studies.definition.refusing import require
 
 CHOKE, LIFT = MV_NAMES
 GAS, OIL = CV_NAMES
@@ -75,8 +75,8 @@ def structure(blocking: Literal["moves", "inputs", "none"] = "moves", *, integer
         blocking: meaning of a block, or ``none`` for 200 single moves.
         integer: whether the choke moves in steps of 2 %.
     """
-    if blocking not in ("moves", "inputs", "none"):
-        raise InputError("structure.blocking", blocking, "'moves', 'inputs' or 'none'")
+    known = blocking in ("moves", "inputs", "none")
+    require(known, "structure.blocking", blocking, "'moves', 'inputs' or 'none'")
     shape: dict[str, Any] = {"blocks": ()} if blocking == "none" else {"blocking": blocking}
     return Structure(
         cv_names=CV_NAMES,
@@ -95,8 +95,7 @@ def tuning_fields(preset: str = "thesis", changes: Fields | None = None) -> Fiel
     Raises:
         InputError: for an unknown preset.
     """
-    if preset not in TUNINGS:
-        raise InputError("tuning", preset, f"one of the presets {', '.join(TUNINGS)}")
+    require(preset in TUNINGS, "tuning", preset, f"one of the presets {', '.join(TUNINGS)}")
     return {**copy.deepcopy(TUNINGS[preset]), **(changes or {})}
 
 

@@ -8,10 +8,10 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from jaxmpc.controller.measurement import FAULTS
-from jaxmpc.errors import InputError
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.trajectory import AXES
 from jaxmpc.process.well.equations import CV_NAMES
+from studies.definition.refusing import located, require
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 STORABLE = tuple(name for names in AXES.values() for name in names if name != "time")
@@ -163,19 +163,9 @@ class ReferenceDefinition(Section, frozen=True):
         return cls(tuple(reference.times.tolist()), setpoints, reference.duration)
 
     def build(self, place: str = "") -> Reference:
-        """The checked reference.
-
-        Args:
-            place: of ``reference`` in the definition, for errors, such as ``base.``.
-
-        Raises:
-            InputError: with the path in the definition.
-        """
-        try:
+        """The checked reference; `place` is the path of the table that it stands in, for errors, such as ``base.``."""
+        with located(lambda field: f"{place}{field}"):
             reference = Reference(self.times, self.setpoints, self.duration)
-        except InputError as error:
-            raise InputError(f"{place}{error.field}", error.value, error.expected, error.hint) from None
-        if reference.cv_count != len(CV_NAMES):
-            found, expected = f"{reference.cv_count} columns", f"one per CV: {', '.join(CV_NAMES)} [m3/h]"
-            raise InputError(f"{place}reference.setpoints", found, expected)
+        found, expected = f"{reference.cv_count} columns", f"one per CV: {', '.join(CV_NAMES)} [m3/h]"
+        require(reference.cv_count == len(CV_NAMES), f"{place}reference.setpoints", found, expected)
         return reference
