@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -224,18 +225,8 @@ def same_matrices(one: Form | None, other: Form) -> bool:
     return all(np.array_equal(a, b) for a, b in zip(matrices(one), matrices(other), strict=True))
 
 
-class Binaries(NamedTuple):
-    """Integers written as their lower limit plus binaries: z = back @ x + base."""
-
-    back: sp.csr_matrix
-    base: np.ndarray
-    binary: np.ndarray
-
-
-def binaries_of(form: Form) -> tuple[Form, Binaries | None]:
-    """The form with every integer as a sum of binaries; untouched where there are none."""
-    if not len(form.integers):
-        return form, None
+def binaries_of(form: Form) -> tuple[Form, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+    """The form with every integer as its lower limit plus binaries, their positions, and the way back to its variables."""
     base = np.zeros(len(form.c))
     base[form.integers] = form.low[form.integers]
     ranges = (form.high - form.low)[form.integers].astype(int)
@@ -253,4 +244,4 @@ def binaries_of(form: Form) -> tuple[Form, Binaries | None]:
         low=np.r_[form.low[kept], np.zeros(len(binary))],
         high=np.r_[form.high[kept], np.ones(len(binary))],
     )
-    return changed, Binaries(back, base, binary)
+    return changed, binary, lambda z: back @ z + base

@@ -54,7 +54,7 @@ class Recording(NamedTuple):
 
 
 class Problems(NamedTuple):
-    """Problems of single samples, ``"problem"`` first; values as `jaxmpc.problem.condense.make_instance` takes them."""
+    """Problems of single samples, ``"problem"`` first; values as `jaxmpc.problem.instance.make_instance` takes them."""
 
     free_response: np.ndarray
     setpoint: np.ndarray
@@ -86,11 +86,10 @@ class Instances:
         return len(self.sample)
 
     def cases(self) -> list[dict[str, Any]]:
-        """The contents of all case files."""
-        return [self.case(i) for i in range(len(self))]
+        """The contents of case files, with the limits of the first move that the mean-move limit (6.6) sets."""
+        return [self._case(i) for i in range(len(self))]
 
-    def case(self, i: int) -> dict[str, Any]:
-        """The content of a case file, with the limits of the first move that the mean-move limit (6.6) sets."""
+    def _case(self, i: int) -> dict[str, Any]:
         problem = self.now.at(i)
         past = problem.pop("past_moves")
         body = case_to_dict(Case(self.model, self.structure, self.tuning, **problem))
@@ -106,25 +105,15 @@ def make_controller(kind: Kind, mode: Mode, model: StepResponseModel) -> Control
     return Controller(structure, presets.tuning(structure), model)
 
 
+@dataclasses.dataclass
 class Recordings:
-    """Recordings of one benchmark run: from this run, from the cache, or made now.
+    """Recordings of one benchmark run: from this run, from the cache, or made now."""
 
-    Args:
-        model: prediction model of every controller.
-        reference: setpoints of the runs.
-        samples: length of the runs, None for the whole reference.
-        say: receives a line per recording.
-    """
-
-    def __init__(
-        self,
-        model: StepResponseModel,
-        reference: Reference,
-        samples: int | None = None,
-        say: Callable[[str], None] = lambda line: None,
-    ):
-        self.model, self.reference, self.samples, self.say = model, reference, samples, say
-        self._live: dict[tuple[Kind, Mode], Recording] = {}
+    model: StepResponseModel  # of every controller
+    reference: Reference  # setpoints of the runs
+    samples: int | None = None  # length of the runs, None for the whole reference
+    say: Callable[[str], None] = lambda line: None  # receives a line per recording
+    _live: dict[tuple[Kind, Mode], Recording] = dataclasses.field(default_factory=dict)
 
     def live(self, kind: Kind, mode: Mode) -> Recording:
         """The run made now, once per benchmark: its times are of this machine and code."""
@@ -172,13 +161,7 @@ class Recordings:
         return self.live(kind, mode) if stored is None else stored
 
     def instances(self, kind: Kind, mode: Mode, count: int, *, hardest: bool = False) -> Instances:
-        """Problems spread evenly over a recorded run, or the ones that took longest.
-
-        Args:
-            kind, mode: of the controller.
-            count: how many at most.
-            hardest: take the longest solves in place of evenly spread ones.
-        """
+        """At most `count` problems, spread evenly over a recorded run or the ones that took longest."""
         recording = self.kept(kind, mode)
         usable = np.arange(2, len(recording.cv))
         if hardest:

@@ -45,18 +45,15 @@ def time_each(solve: Callable[[S], T], problems: Iterable[S]) -> tuple[np.ndarra
 class Judge:
     """Judges plans of a list of problems: (6.6) straight from the equations, against the best plan anyone found."""
 
-    def __init__(self, cases: Sequence[dict]):  # as `instances.Instances.case` makes them
+    def __init__(self, cases: Sequence[dict]):  # as `instances.Instances.cases` makes them
         self.cases = list(cases)
         self.best = np.full(len(self.cases), math.inf)
         self._seen: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
     def hear(self, who: str, plans: Sequence[np.ndarray | None], at: Any = None) -> None:
-        """Take plans in; the cheapest feasible one of each problem is the reference of all.
+        """Take plans ``"block mv"`` [MV unit] in, of the problems at some positions or of the first ones.
 
-        Args:
-            who: found them.
-            plans: ``"block mv"`` [MV unit] each, None for none.
-            at: positions of the problems; the first ones if not given.
+        The cheapest feasible one of each problem is the reference of all.
         """
         where = np.arange(len(plans)) if at is None else np.asarray(at, dtype=int)
         costs, wrongs = np.full(len(plans), math.nan), np.full(len(plans), math.nan)

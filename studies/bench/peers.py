@@ -201,23 +201,21 @@ def daqp(form: Form, tolerance: float, seconds: float) -> PeerAnswer:
     """DAQP: dual active set on dense matrices; integers become binaries that it branches on."""
     import daqp
 
-    form, spread = binaries_of(form)
+    form, binary, back = binaries_of(form)
     A, b, G, low, high = rows_of(form)
     rows = np.ascontiguousarray(sp.vstack([A, G]).toarray())
     lower = np.clip(np.r_[form.low, b, low], -HUGE, None)
     upper = np.clip(np.r_[form.high, b, high], None, HUGE)
     sense = np.zeros(len(lower), dtype=np.int32)
     sense[lower == upper] = 5  # an equation, always active
-    if spread is not None:
-        sense[spread.binary] = 16
+    sense[binary] = 16
     hessian = np.ascontiguousarray(form.P.toarray())
     options = dict(primal_tol=max(tolerance, 1e-10), dual_tol=1e-11, eps_prox=1e-4, iter_limit=100_000)
     problem = hessian, form.c.copy(), rows, upper, lower, sense
     elapsed, (x, _, flag, _) = taken(lambda: daqp.solve(*problem, time_limit=seconds, **options))
     if flag not in (1, 2, 4):  # 4: solved, but its certificate is left open; the judge decides
         return PeerAnswer("infeasible" if flag == -1 else "limit", seconds=elapsed)
-    z = np.array(x)[: len(form.c)]
-    return PeerAnswer("optimal", z if spread is None else spread.back @ z + spread.base, seconds=elapsed)
+    return PeerAnswer("optimal", back(np.array(x)[: len(form.c)]), seconds=elapsed)
 
 
 @anew
@@ -272,11 +270,11 @@ def scip(form: Form, tolerance: float, seconds: float) -> PeerAnswer:
     limits = {"limits/time": seconds, "limits/gap": tolerance, "numerics/feastol": 1e-8}
     for name, value in limits.items():
         model.setParam(name, value)
-    integer = set(form.integers.tolist())
-    z = [
-        model.addVar(vtype="I" if i in integer else "C", lb=_finite(low), ub=_finite(high))
-        for i, (low, high) in enumerate(zip(form.low, form.high, strict=True))
-    ]
+    kinds = np.full(len(form.c), "C")
+    kinds[form.integers] = "I"
+    finite = lambda limits: [limit if math.isfinite(limit) else None for limit in limits.tolist()]  # noqa: E731
+    ranges = zip(kinds.tolist(), finite(form.low), finite(form.high), strict=True)
+    z = [model.addVar(vtype=kind, lb=low, ub=high) for kind, low, high in ranges]
     for row, low, high in zip(form.A, form.row_low, form.row_high, strict=True):
         entries = zip(row.indices, row.data, strict=True)
         terms = pyscipopt.quicksum(float(value) * z[k] for k, value in entries)
@@ -303,10 +301,6 @@ def scip(form: Form, tolerance: float, seconds: float) -> PeerAnswer:
     point = np.array([model.getVal(variable) for variable in z])
     done = status in ("optimal", "gaplimit")
     return PeerAnswer("optimal" if done else "limit", point, bound, elapsed)
-
-
-def _finite(limit: float) -> float | None:
-    return limit if math.isfinite(limit) else None
 
 
 def gurobi(tolerance: float, seconds: float) -> Solve:

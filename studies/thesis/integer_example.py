@@ -12,6 +12,7 @@ import math
 from fractions import Fraction
 
 from jaxmpc.errors import InputError
+from studies.definition.refusing import require
 
 Point = tuple[Fraction, Fraction]
 
@@ -93,8 +94,7 @@ def corners(program: IntegerProgram) -> list[Point]:
     """
     found = {crossing(*pair) for pair in itertools.combinations(program.rows, 2)}
     inside = [point for point in found if point is not None and program.holds(point)]
-    if not inside:
-        raise InputError("program.rows", len(program.rows), "rows that some point satisfies")
+    require(inside, "program.rows", len(program.rows), "rows that some point satisfies")
     return hull(inside)
 
 
@@ -109,14 +109,10 @@ def integer_points(program: IntegerProgram) -> list[Point]:
     Raises:
         InputError: if there is none.
     """
-    spread = []
-    for axis in (0, 1):
-        values = [point[axis] for point in corners(program)]
-        spread.append(range(math.ceil(min(values)), math.floor(max(values)) + 1))
+    spread = (range(math.ceil(min(x)), math.floor(max(x)) + 1) for x in zip(*corners(program), strict=True))
     points = [(Fraction(i), Fraction(j)) for i, j in itertools.product(*spread)]
     found = [point for point in points if program.holds(point)]
-    if not found:
-        raise InputError("program.rows", len(program.rows), "rows that some integer point satisfies")
+    require(found, "program.rows", len(program.rows), "rows that some integer point satisfies")
     return found
 
 
@@ -174,10 +170,8 @@ def best_cut(program: IntegerProgram) -> Cut:
     """
     x = relaxed_optimum(program)
     cutting = [row for row in facets(hull(integer_points(program))) if row.excess(x) > 0]
-    if not cutting:
-        raise InputError(
-            "program", "an integer relaxed optimum", "a relaxed optimum outside the integer hull"
-        )
+    expected = "a relaxed optimum outside the integer hull"
+    require(cutting, "program", "an integer relaxed optimum", expected)
 
     def after(row: Row) -> Point:
         return relaxed_optimum(dataclasses.replace(program, rows=(*program.rows, row)))

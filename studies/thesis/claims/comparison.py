@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from studies.definition.presets import CHOKE, GAS, OIL
+from studies.definition.presets import CHOKE
 from studies.kpi.evaluate import distance_to_reach, final_deviation, window_deviation
 from studies.thesis.claims.limits import ALIKE, FAR_MORE, HUNTING, OUT_OF_REACH, STATIONARY
-from studies.thesis.claims.record import Evidence, Finding, index, short
+from studies.thesis.claims.record import Evidence, Finding, short
 from studies.thesis.claims.why import price_of_a_step
 
 # ------------------------------------------------------------------------------------------------ oscillation
@@ -59,19 +59,13 @@ def travels(evidence: Evidence, rounded: str, integer: str) -> Finding:
 # ------------------------------------------------------------------------------------------------ deviation
 
 
-def _means(evidence: Evidence, role: str) -> np.ndarray:
-    mean = evidence.key.mean_absolute_deviation.sel(controller=evidence.roles[role])
-    return np.array([float(mean.sel(cv=cv)) for cv in (GAS, OIL)])
-
-
 def deviates_less(evidence: Evidence, rounded: str, integer: str) -> Finding:
     """Rounding deviates less in the mean; where it does not, the window that costs most."""
     roles, data = (rounded, integer), evidence.data
-    a, b = (_means(evidence, role) for role in roles)
+    a, b = (evidence.figure("mean_absolute_deviation", role) for role in roles)
     more = np.subtract(*(window_deviation(data, evidence.roles[role]) for role in roles))
     texts, why = [], []
-    for i, cv in enumerate((GAS, OIL)):
-        windows = more[:, index(data, cv)]
+    for i, (cv, windows) in enumerate(zip(data.cv.values, more.T, strict=True)):
         texts.append(
             f"{short(cv)} {a[i]:.4g} against {b[i]:.4g} m3/h, "
             f"less in {(windows < 0).sum()} of {len(windows)} windows"
@@ -87,10 +81,10 @@ def deviates_less(evidence: Evidence, rounded: str, integer: str) -> Finding:
 
 
 def _ratios(evidence: Evidence, smooth: str, integer: str) -> tuple[np.ndarray, dict[str, Any]]:
-    a, b = (_means(evidence, role) for role in (integer, smooth))
+    a, b = (evidence.figure("mean_absolute_deviation", role) for role in (integer, smooth))
     pairs = [
         f"{short(cv)} {x:.4g} against {y:.4g} m3/h, {x / y:.2f} times"
-        for cv, x, y in zip((GAS, OIL), a, b, strict=True)
+        for cv, x, y in zip(evidence.data.cv.values, a, b, strict=True)
     ]
     return a / b, {"pairs": "; ".join(pairs)}
 

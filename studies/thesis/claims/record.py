@@ -28,81 +28,51 @@ ROLES = {  # by kind of controller and actuator, whatever the run is called
     ("mixed-integer", "step"): "integer",
 }
 Condition = bool | np.bool_
+# times of the controller steps of a run [s], "sample", by its name; the stored ones if None
+Clock = Callable[[str], np.ndarray] | None
 
 
 class Statement(msgspec.Struct, frozen=True):
-    """One statement of the thesis.
+    """One statement of the thesis."""
 
-    Attributes:
-        id: short and unique.
-        section: of the thesis that says it.
-        statement: the thesis, in our words.
-        definition: how it is measured.
-        rule: when it counts as holding.
-        study: of `studies.thesis.catalogue.STUDIES`, whose results are measured.
-        figures: ids of the figures that show it.
-    """
-
-    id: str
-    section: str
-    statement: str
-    definition: str
-    rule: str
-    study: str
-    figures: tuple[str, ...]
+    id: str  # short and unique
+    section: str  # of the thesis that says it
+    statement: str  # the thesis, in our words
+    definition: str  # how it is measured
+    rule: str  # when it counts as holding
+    study: str  # of `studies.thesis.catalogue.STUDIES`, whose results are measured
+    figures: tuple[str, ...]  # ids of the figures that show it
 
 
 class Claim(Statement, frozen=True):
-    """A statement and what the results say.
+    """A statement and what the results say."""
 
-    Attributes:
-        value: the numbers, with units.
-        verdict: one of `VERDICTS`.
-        reason: what the data say about why it does not hold; empty if it does.
-    """
-
-    value: str
-    verdict: str
-    reason: str
+    value: str  # the numbers, with units
+    verdict: str  # one of `VERDICTS`
+    reason: str  # what the data say about why it does not hold; empty if it does
 
     def written(self) -> dict[str, Any]:
         """The fields by name in the order of the files."""
-        words = ("id", "section", "statement", "definition", "rule")
-        return {
-            name: getattr(self, name) for name in (*words, "value", "verdict", "reason", "figures", "study")
-        }
+        words = ("id", "section", "statement", "definition", "rule", "value", "verdict", "reason")
+        return {name: getattr(self, name) for name in (*words, "figures", "study")}
 
 
 class Finding(NamedTuple):
-    """What a measurement gives.
+    """What a measurement gives."""
 
-    Attributes:
-        conditions: those of the rule; none if it cannot be tested on these results.
-        numbers: for the words of the row, by name.
-        why: which of its reasons is shown unless all conditions are met, where it has several.
-        instead: of the words of the row on its numbers.
-    """
-
-    conditions: tuple[Condition, ...]
-    numbers: dict[str, Any]
-    why: str = ""
-    instead: str = ""
+    conditions: tuple[Condition, ...]  # those of the rule; none if it cannot be tested on these results
+    numbers: dict[str, Any]  # for the words of the row, by name
+    why: str = ""  # which of its reasons is shown unless all conditions are met, where it has several
+    instead: str = ""  # of the words of the row on its numbers
 
 
 class Row(Statement, frozen=True, forbid_unknown_fields=True):
-    """A statement that can be measured, from ``rows.toml``.
+    """A statement that can be measured, from ``rows.toml``."""
 
-    Attributes:
-        needs: roles or names of the runs that the measurement is given.
-        measure: function that takes the evidence and the names of `needs`, as ``module.function``.
-        value: words for its numbers.
-        reason: words for why it fails, or several by what the measurement says.
-    """
-
-    needs: tuple[str, ...]
-    measure: str
-    value: str
-    reason: str | dict[str, str]
+    needs: tuple[str, ...]  # roles or names of the runs that the measurement is given
+    measure: str  # function that takes the evidence and the names of `needs`, as module.function
+    value: str  # words for its numbers
+    reason: str | dict[str, str]  # words for why it fails, or several by what the measurement says
 
 
 class Rates:
@@ -117,25 +87,14 @@ class Rates:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the rows of one study are measured on.
+    """What the rows of one study are measured on."""
 
-    Attributes:
-        data: the finished runs of the study, loaded.
-        clock: times of the controller steps of a run [s], ``"sample"``, by its name; the stored ones if None.
-        given: from `studies.kpi.evaluate.key_figures`, if there already.
-    """
-
-    data: xr.Dataset
-    clock: Callable[[str], np.ndarray] | None = None
-    given: xr.Dataset | None = None
+    data: xr.Dataset  # the finished runs of the study, loaded
+    clock: Clock = None
+    given: xr.Dataset | None = None  # from `studies.kpi.evaluate.key_figures`, if there already
 
     @classmethod
-    def of(
-        cls,
-        data: xr.Dataset,
-        clock: Callable[[str], np.ndarray] | None = None,
-        given: xr.Dataset | None = None,
-    ) -> Evidence:
+    def of(cls, data: xr.Dataset, clock: Clock = None, given: xr.Dataset | None = None) -> Evidence:
         """From results with at least one finished run."""
         return cls(completed(data).load(), clock, given)
 
@@ -178,8 +137,7 @@ class Evidence:
 
     def times(self, role: str) -> np.ndarray:
         """Times of the controller steps [s], ``"sample"``."""
-        name = self.roles[role]
-        return self.run(role).solve_time.values if self.clock is None else self.clock(name)
+        return self.run(role).solve_time.values if self.clock is None else self.clock(self.roles[role])
 
 
 def claim_of(row: Row, found: Finding) -> Claim:
@@ -197,9 +155,7 @@ def claim_of(row: Row, found: Finding) -> Claim:
 
 def verdict(*conditions: Condition) -> str:
     """Holds if all conditions are met, in part if some are."""
-    if all(conditions):
-        return VERDICTS[0]
-    return VERDICTS[1] if any(conditions) else VERDICTS[2]
+    return VERDICTS[0 if all(conditions) else 1 if any(conditions) else 2]
 
 
 def short(cv: str) -> str:
@@ -232,11 +188,8 @@ def choke_travel(run: xr.Dataset) -> float:
 
 def quarters(window: np.ndarray) -> list[np.ndarray]:
     """Samples of the last quarter of every setpoint window."""
-    out = []
-    for w in range(int(window.max()) + 1):
-        samples = np.flatnonzero(window == w)
-        out.append(samples[(3 * len(samples)) // 4 :])
-    return out
+    groups = (np.flatnonzero(window == w) for w in range(int(window.max()) + 1))
+    return [samples[(3 * len(samples)) // 4 :] for samples in groups]
 
 
 def swing(values: np.ndarray, groups: list[np.ndarray]) -> np.ndarray:
