@@ -55,7 +55,7 @@ def judge(row: Row, evidence: Evidence | None) -> Claim:
         return claim_of(row, nothing)
     module, _, name = row.measure.partition(".")
     measures = next(known for known in MEASURES if known.__name__.endswith(f".{module}"))
-    return claim_of(row, getattr(measures, name)(evidence, *row.needs))
+    return claim_of(row, getattr(measures, name)(evidence, *map(evidence.run, row.needs)))
 
 
 def claims(data: xr.Dataset, figures: xr.Dataset | None = None) -> list[Claim]:

@@ -28,6 +28,7 @@ ROLES = {  # by kind of controller and actuator, whatever the run is called
     ("mixed-integer", "step"): "integer",
 }
 Condition = bool | np.bool_
+Run = xr.Dataset  # the results with one controller
 # times of the controller steps of a run [s], "sample", by its name; the stored ones if None
 Clock = Callable[[str], np.ndarray] | None
 
@@ -70,7 +71,7 @@ class Row(Statement, frozen=True, forbid_unknown_fields=True):
     """A statement that can be measured, from ``rows.toml``."""
 
     needs: tuple[str, ...]  # roles or names of the runs that the measurement is given
-    measure: str  # function that takes the evidence and the names of `needs`, as module.function
+    measure: str  # function that takes the evidence and the runs of `needs`, as module.function
     value: str  # words for its numbers
     reason: str | dict[str, str]  # words for why it fails, or several by what the measurement says
 
@@ -112,17 +113,18 @@ class Evidence:
             out.setdefault(ROLES.get((str(kind), str(actuator)), name), name)
         return out
 
-    def run(self, role: str) -> xr.Dataset:
+    def run(self, role: str) -> Run:
         """The results of one run."""
         return self.data.sel(controller=self.roles[role])
 
-    def figure(self, name: str, role: str) -> Any:
-        """A key figure of one run: a number or an array."""
-        return self.key[name].sel(controller=self.roles[role]).values[()]
+    @property
+    def runs(self) -> list[Run]:
+        """The results of every run."""
+        return [self.data.isel(controller=i) for i in range(self.data.sizes["controller"])]
 
-    def half(self, role: str) -> np.ndarray:
-        """Half widths of the deadzone, ``"cv"`` [CV unit]."""
-        return self.run(role).tuning_deadzone.values
+    def figure(self, name: str, run: Run) -> Any:
+        """A key figure of one run: a number or an array."""
+        return self.key[name].sel(controller=name_of(run)).values[()]
 
     def rates(self, values: np.ndarray) -> Rates:
         """Numbers ``"cv"`` for the words of a row."""
@@ -135,9 +137,9 @@ class Evidence:
         first = [f"{float(self.data.time.values[label == w][0]):,.0f}" for w in which]
         return f"window{'s' if len(first) > 1 else ''} from {', '.join(first)} s"
 
-    def times(self, role: str) -> np.ndarray:
+    def times(self, run: Run) -> np.ndarray:
         """Times of the controller steps [s], ``"sample"``."""
-        return self.run(role).solve_time.values if self.clock is None else self.clock(self.roles[role])
+        return run.solve_time.values if self.clock is None else self.clock(name_of(run))
 
 
 def claim_of(row: Row, found: Finding) -> Claim:
@@ -158,12 +160,17 @@ def verdict(*conditions: Condition) -> str:
     return VERDICTS[0 if all(conditions) else 1 if any(conditions) else 2]
 
 
+def name_of(run: Run) -> str:
+    """Of the controller of a run."""
+    return str(run.controller.item())
+
+
 def short(cv: str) -> str:
     """``gas`` or ``oil``."""
     return str(cv).removesuffix("_rate")
 
 
-def index(run: xr.Dataset, name: str) -> int:
+def index(run: Run, name: str) -> int:
     """Position of a CV or an MV on its axis."""
     axis = "mv" if name in (CHOKE, LIFT) else "cv"
     return [str(known) for known in run[axis].values].index(name)
@@ -174,13 +181,13 @@ def late(data: xr.Dataset) -> xr.Dataset:
     return data.isel(time=np.flatnonzero(data.time.values > data.time.values[-1] - LATE))
 
 
-def late_deviation(run: xr.Dataset) -> np.ndarray:
+def late_deviation(run: Run) -> np.ndarray:
     """Mean of measured minus setpoint over the last `LATE` seconds, ``"cv"`` [CV unit]."""
     end = late(run)
     return (end.measurement - end.setpoint).mean("time").values
 
 
-def choke_travel(run: xr.Dataset) -> float:
+def choke_travel(run: Run) -> float:
     """Travel of the actual choke position from the first sample on [%]."""
     position = run.position.sel(mv=CHOKE).values
     return float(travel(moves_of(position, position[0])))

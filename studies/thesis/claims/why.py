@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import xarray as xr
 
 from studies.definition.presets import CHOKE, GAS, LIFT, OIL
 from studies.kpi.loop import closed_loop_cost
-from studies.thesis.claims.record import index
+from studies.thesis.claims.record import Run, index
 
 
-def slope(run: xr.Dataset, deviation: np.ndarray) -> np.ndarray:
+def slope(run: Run, deviation: np.ndarray) -> np.ndarray:
     """Derivative of what one sample costs in (6.6) by the CV, ``"cv"``: 2 Q d + sign(d) (2 S eta + s [eta > 0]).
 
     Here `deviation` is d = y - r, ``"cv"`` [CV unit], eta = max(|d| - c, 0), and the tuning that of the run.
@@ -22,7 +21,7 @@ def slope(run: xr.Dataset, deviation: np.ndarray) -> np.ndarray:
     return 2 * weight * deviation + np.sign(deviation) * (2 * quadratic * beyond + linear * (beyond > 0))
 
 
-def pulls(run: xr.Dataset, deviation: np.ndarray) -> np.ndarray:
+def pulls(run: Run, deviation: np.ndarray) -> np.ndarray:
     """What another unit of each MV would change of the cost of one settled sample, ``"cv mv"``.
 
     That is `slope` times the steady gains of the prediction model; where the columns add up to about zero, the MV stands
@@ -31,7 +30,7 @@ def pulls(run: xr.Dataset, deviation: np.ndarray) -> np.ndarray:
     return slope(run, deviation)[:, None] * run.model_coefficient.values[:, :, -1]
 
 
-def compromise(run: xr.Dataset, deviation: np.ndarray) -> str:
+def compromise(run: Run, deviation: np.ndarray) -> str:
     """How oil and gas pull at the lift at some deviation, in words with numbers."""
     pull = pulls(run, deviation)[:, index(run, LIFT)]
     oil, gas = pull[index(run, OIL)], pull[index(run, GAS)]
@@ -40,7 +39,7 @@ def compromise(run: xr.Dataset, deviation: np.ndarray) -> str:
     return f"the pulls of oil ({oil:+.2g}) and gas ({gas:+.2g}) on the lift, per m3/h of lift and sample, {words}"
 
 
-def exchange(run: xr.Dataset) -> str:
+def exchange(run: Run) -> str:
     """How little the larger weight of oil is worth, in words with numbers."""
     oil, gas, lift = (index(run, name) for name in (OIL, GAS, LIFT))
     gain, weight = run.model_coefficient.values[:, lift, -1], run.tuning_cv_weight.values
@@ -54,7 +53,7 @@ def exchange(run: xr.Dataset) -> str:
     )
 
 
-def price_of_a_step(run: xr.Dataset, deviation: np.ndarray) -> tuple[float, float]:
+def price_of_a_step(run: Run, deviation: np.ndarray) -> tuple[float, float]:
     """What one whole step of the choke, made now from rest, would save over the horizon by the model, and what it costs.
 
     Args:
@@ -76,7 +75,7 @@ def price_of_a_step(run: xr.Dataset, deviation: np.ndarray) -> tuple[float, floa
     return saved, float(run.tuning_move_weight.values[at]) * size**2
 
 
-def horizon_cost(run: xr.Dataset, deviation: np.ndarray) -> float:
+def horizon_cost(run: Run, deviation: np.ndarray) -> float:
     """What the deviations of a horizon, ``"horizon cv"`` [CV unit], cost in (6.6), moves and limits left out."""
     names = ("cv_weight", "soft_quadratic", "soft_linear", "deadzone", "move_weight")
     weights = {name: run[f"tuning_{name}"].values for name in names}
