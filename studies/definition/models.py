@@ -22,15 +22,11 @@ _steady_state = jax.jit(steady_state)
 def identify_models(
     points: Iterable[Point], samples: int = SAMPLES, *, progress: Callable[[int, int], None] | None = None
 ) -> dict[Point, StepResponseModel]:
-    """Step-response models of the shipped well at some working points.
+    """Models of the shipped well by working point ``(choke [%], gas lift [m3/h])``, in the order of first appearance.
 
     Args:
-        points: ``(choke [%], gas lift [m3/h])``; repeats are identified once.
         samples: number of coefficients N.
         progress: called with ``(done, total)`` models.
-
-    Returns:
-        Models by working point, in the order of first appearance.
 
     Raises:
         InputError: naming the working point, for one outside its range (the step test goes 2 % and 100 m3/h further) or

@@ -46,25 +46,19 @@ _THESIS: Fields = {
 }
 
 
-def _changed(**fields: Any) -> Fields:
-    return {**copy.deepcopy(_THESIS), **fields}
-
+_PLAIN: Fields = _THESIS | {name: {GAS: 0.0, OIL: 0.0} for name in ("soft_quadratic", "soft_linear")}
 
 TUNINGS: dict[str, Fields] = {
     # Table 1, choke moves charged 250 per (%)^2 for every controller.
     "thesis": _THESIS,
     # Table 1 with its 1000 taken per (%)^2, as the thesis's continuous controllers did.
-    "thesis-literal": _changed(move_weight={CHOKE: 1000.0, LIFT: 0.2}),
+    "thesis-literal": _THESIS | {"move_weight": {CHOKE: 1000.0, LIFT: 0.2}},
     # A quarter of the weight (1000 / 16): shows what the well does when the choke moves too readily.
-    "thesis-light": _changed(move_weight={CHOKE: 62.5, LIFT: 0.2}),
+    "thesis-light": _THESIS | {"move_weight": {CHOKE: 62.5, LIFT: 0.2}},
     # Without Soft MPC, as hard everywhere as the soft controller is far outside its deadzone (figure 13).
-    "no-soft": _changed(
-        soft_quadratic={GAS: 0.0, OIL: 0.0},
-        soft_linear={GAS: 0.0, OIL: 0.0},
-        cv_weight={GAS: 2e-4, OIL: 0.2},
-    ),
+    "no-soft": _PLAIN | {"cv_weight": {GAS: 2e-4, OIL: 0.2}},
     # Without Soft MPC, the extra penalty simply left out.
-    "no-soft-plain": _changed(soft_quadratic={GAS: 0.0, OIL: 0.0}, soft_linear={GAS: 0.0, OIL: 0.0}),
+    "no-soft-plain": _PLAIN,
 }
 
 

@@ -71,9 +71,9 @@ class StudyDefinition:
         Raises:
             InputError: naming the path of the field, for unknown or missing keys and wrong types.
         """
-        if isinstance(body, dict):
-            _check_plain(body)
-        file = _convert({"study": {}} | body if isinstance(body, dict) else body, StudyFile, "")
+        require(isinstance(body, dict), "study definition", body, "a table")
+        _check_plain(body)
+        file = _convert({"study": {}} | body, StudyFile, "")
         named = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", file.study.name)
         expected = "up to 100 letters, digits, '-', '_' and '.': it names the folder of the results"
         require(named, "study.name", file.study.name, expected)
