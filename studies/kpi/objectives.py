@@ -35,19 +35,12 @@ DIRECTIONS = ("minimize", "maximize")
 
 @dataclasses.dataclass(frozen=True)
 class Objective:
-    """One objective.
-
-    Attributes:
-        name: as in the definition.
-        direction: ``minimize`` or ``maximize``.
-        figure: key figure that it is made of.
-        channel: position of its CV or MV; None where the figure has no channels, and for the combined deviation.
-    """
+    """One objective, its name and direction as in the definition."""
 
     name: str
-    direction: str
-    figure: str
-    channel: int | None = None
+    direction: str  # ``minimize`` or ``maximize``
+    figure: str  # key figure that it is made of
+    channel: int | None = None  # position of its CV or MV; None without, and for the combined deviation
 
     def values(self, fields: Mapping[str, Any]) -> np.ndarray:
         """Per scenario, from the stored variables ``"scenario ..."`` by name; NaN for a run that is not complete."""
@@ -60,12 +53,7 @@ class Objective:
 
 
 def objective(path: str, name: str, direction: str = "minimize") -> Objective:
-    """The objective of a name.
-
-    Args:
-        path: where the name stands, for errors.
-        name: of the objective.
-        direction: ``minimize`` or ``maximize``.
+    """The objective of a name; `path` is where the name stands.
 
     Raises:
         InputError: for an unknown name, a figure with channels without one, and figures of the clock.

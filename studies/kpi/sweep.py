@@ -8,7 +8,6 @@ float, so that a run whose numbers are not all finite can answer NaN instead of 
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -138,37 +137,21 @@ ALWAYS = tuple(item.name for item in KPIS[-9:])
 
 
 class Run(NamedTuple):
-    """One run as arrays, fields as in `jaxmpc.loop.trajectory.Trajectory`; `runs_of` gives many, lanes first.
+    """One run as arrays, fields as in `jaxmpc.loop.trajectory.Trajectory`; `runs_of` gives many, lanes first."""
 
-    Attributes:
-        cv: ``"sample cv"``, measured by sensors without fault, noise included.
-        setpoint: ``"sample cv"``, at the same time as `cv`.
-        mv: ``"sample mv"``, position of the actuators.
-        mv_demand: ``"sample mv"``, demand of the controller.
-        move: ``"sample mv"``, demand minus previous demand.
-        window: ``"sample"``, label of the setpoint window.
-        objective: ``"sample"``, of the applied plan, NaN where there was none.
-        gap: ``"sample"``, relative gap, NaN where there was no plan.
-        solve_time: ``"sample"``, of one controller step [s].
-        optimal: ``"sample"``, whether the solve ended optimal.
-        fallback: ``"sample"``, whether the MVs were held.
-        left_out: ``"sample cv"``, whether the measurement was bad.
-        off: ``"sample cv"``, whether the CV was switched off.
-    """
-
-    cv: Any
-    setpoint: Any
-    mv: Any
-    mv_demand: Any
-    move: Any
-    window: Any
-    objective: Any
-    gap: Any
-    solve_time: Any
-    optimal: Any
-    fallback: Any
-    left_out: Any
-    off: Any
+    cv: Any  # "sample cv"
+    setpoint: Any  # "sample cv"
+    mv: Any  # "sample mv", position of the actuators
+    mv_demand: Any  # "sample mv"
+    move: Any  # "sample mv", demand minus previous demand
+    window: Any  # "sample", label of the setpoint window
+    objective: Any  # "sample", of the applied plan, NaN where there was none
+    gap: Any  # "sample", NaN where there was no plan
+    solve_time: Any  # "sample" [s]
+    optimal: Any  # "sample", whether the solve ended optimal
+    fallback: Any  # "sample", whether the MVs were held
+    left_out: Any  # "sample cv", whether the measurement was bad
+    off: Any  # "sample cv", whether the CV was switched off
 
 
 class Tuned(NamedTuple):
@@ -242,9 +225,8 @@ def runs_of(batch: TrajectoryBatch, window) -> Run:
             f"{labels.dtype} of shape {list(labels.shape)}",
             f"whole numbers, one per sample [{shape[1]}] or per lane and sample {list(shape)}",
         )
-    numbers = {key: np.asarray(batch[key], dtype=np.float64) for key in _NUMBERS}
     return Run(
-        **numbers,
+        **{key: np.asarray(batch[key], dtype=np.float64) for key in _NUMBERS},
         setpoint=np.asarray(batch.setpoint, dtype=np.float64),
         window=np.broadcast_to(labels.astype(np.int32), shape),
         optimal=np.asarray(batch["status"]) == OPTIMAL,
@@ -319,10 +301,9 @@ def run_kpis(
         "switched_off": run.off.sum(axis=0),
         "finite": finite,
     }
-    numbers = {name: jnp.asarray(value, dtype=jnp.float64) for name, value in figures.items()}
     return {
-        name: value if name in ALWAYS else jnp.where(finite, value, jnp.nan)
-        for name, value in numbers.items()
+        name: jnp.where(finite | (name in ALWAYS), jnp.asarray(value, dtype=jnp.float64), jnp.nan)
+        for name, value in figures.items()
     }
 
 
@@ -380,9 +361,4 @@ def _per_lane(field: str, given, lanes: int, size: tuple[int, ...]) -> Any:
     return np.broadcast_to(value, (lanes, *size))
 
 
-@functools.partial(jax.jit, static_argnames="channels")
-def _batched(runs: Run, tunings: Tuned, tolerance, dt, channels: Channels) -> dict[str, Array]:
-    """`run_kpis` of every lane."""
-    return jax.vmap(lambda run, tuning, near: run_kpis(run, tuning, near, dt, channels))(
-        runs, tunings, tolerance
-    )
+_batched = jax.jit(jax.vmap(run_kpis, in_axes=(0, 0, 0, None, None)), static_argnames="channels")
