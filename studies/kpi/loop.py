@@ -24,8 +24,11 @@ Samples = Float[ArrayLike, " sample"]  # moves or positions of one MV, or a numb
 Labels = Int[ArrayLike, " sample"]
 Cvs = Float[ArrayLike, "sample cv"]
 PerCv = Float[ArrayLike, " cv"]
-Values, Limits = Float[ArrayLike, "sample channel"], Float[ArrayLike, " channel"]
-Number, Count, Statistic = Float[Array, ""], Int[Array, ""], Float[Array, " cv"]
+Values = Float[ArrayLike, "sample channel"]
+Limits = Float[ArrayLike, " channel"]
+Number = Float[Array, ""]
+Count = Int[Array, ""]
+Statistic = Float[Array, " cv"]
 
 
 def moves_of(position: Samples, start) -> Float[Array, " sample"]:
