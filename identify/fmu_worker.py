@@ -134,15 +134,12 @@ def library_of(folder: Path, description: Any) -> Path:
     if library.is_file():
         return library
     others = sorted(other.parent.name for other in folder.glob("binaries/*/*") if other.is_file())
+    has, hint = "none", ""
     if others:
-        raise RefusedError(
-            f"an FMU with a library for {here} (it has one for {', '.join(dict.fromkeys(others))})"
-        )
-    if any(folder.glob("sources/*")):
-        raise RefusedError(
-            f"an FMU with a library for {here} (it has only sources)", "Compile it: fmpy compile FILE.fmu"
-        )
-    raise RefusedError(f"an FMU with a library for {here} (it has none)")
+        has = f"one for {', '.join(dict.fromkeys(others))}"
+    elif any(folder.glob("sources/*")):
+        has, hint = "only sources", "Compile it: fmpy compile FILE.fmu"
+    raise RefusedError(f"an FMU with a library for {here} (it has {has})", hint)
 
 
 class Runner:
