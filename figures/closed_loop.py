@@ -20,7 +20,7 @@ from figures import panels, style
 from jaxmpc.loop.trajectory import Trajectory
 from studies.definition.presets import CHOKE
 
-RUN = "run"  # name of the one controller in results of one run; `studies.notebooks.loop` says the same
+RUN = "run"  # name of the one controller in results of one run
 PINNED: dict[str, Any] = {"color": "#9A9A9A", "linewidth": 1.8, "label": "pinned", "zorder": 1.5}
 
 
@@ -106,6 +106,8 @@ def of_trajectory(trajectory: Trajectory, deadzone: Any, kind: str, actuator: st
             "measurement": (("time", "cv"), trajectory.cv),
             "position": (("time", "mv"), trajectory.mv),
             "demand": (("time", "mv"), trajectory.mv_demand),
+            "move": (("time", "mv"), trajectory.move),
+            "bias": (("time", "cv"), trajectory.bias),
             "setpoint": (("time", "cv"), trajectory.setpoint),
         },
         {

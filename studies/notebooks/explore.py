@@ -106,17 +106,21 @@ def _(RATIOS, mo, preset, presets):
             full_width=True,
         )
 
-    choke_weight = _slider("choke move weight", _fields["move_weight"]["choke"], "1/%²")
-    oil_weight = _slider("oil weight", _fields["cv_weight"]["oil_rate"], "1/(m³/h)²")
-    gas_weight = _slider("gas weight", _fields["cv_weight"]["gas_rate"], "1/(m³/h)²")
-    oil_deadzone = _slider(
-        "oil deadzone", _fields["deadzone"]["oil_rate"], "m³/h", [0.5 * k for k in range(41)]
+    tuning = mo.ui.dictionary(
+        {
+            "choke_weight": _slider("choke move weight", _fields["move_weight"]["choke"], "1/%²"),
+            "oil_deadzone": _slider(
+                "oil deadzone", _fields["deadzone"]["oil_rate"], "m³/h", [0.5 * k for k in range(41)]
+            ),
+            "gas_deadzone": _slider(
+                "gas deadzone", _fields["deadzone"]["gas_rate"], "m³/h", [100.0 * k for k in range(31)]
+            ),
+            "oil_weight": _slider("oil weight", _fields["cv_weight"]["oil_rate"], "1/(m³/h)²"),
+            "gas_weight": _slider("gas weight", _fields["cv_weight"]["gas_rate"], "1/(m³/h)²"),
+        }
     )
-    gas_deadzone = _slider(
-        "gas deadzone", _fields["deadzone"]["gas_rate"], "m³/h", [100.0 * k for k in range(31)]
-    )
-    tuning_panel = mo.vstack([choke_weight, oil_deadzone, gas_deadzone, oil_weight, gas_weight], gap=0.4)
-    return choke_weight, gas_deadzone, gas_weight, oil_deadzone, oil_weight, tuning_panel
+    tuning_panel = mo.vstack(list(tuning.elements.values()), gap=0.4)
+    return tuning, tuning_panel
 
 
 @app.cell
@@ -126,28 +130,20 @@ def _(explore, mo):
             start, stop, step, value=value, label=label, show_value=True, debounce=True, full_width=True
         )
 
-    oil_setpoint = _slider(80, 240, 1, 152, "oil setpoint [m³/h]")
-    gas_setpoint = _slider(5000, 17000, 20, 9640, "gas setpoint [m³/h]")
-    pressure = _slider(-4, 4, 0.25, 0, "reservoir pressure change [bar]")
-    pressure_time = _slider(0, 1790, 10, 900, "from [s]")
-    model_choke = _slider(6, 96, 2, 50, "model: choke [%]")
-    model_lift = _slider(2500, 9500, 250, 7500, "model: lift [m³/h]")
-    setpoint_panel = mo.vstack(
-        [mo.md(f"**Setpoints** from {explore.STEP_TIME:g} s"), oil_setpoint, gas_setpoint], gap=0.4
+    scenario = mo.ui.dictionary(
+        {
+            "oil_setpoint": _slider(80, 240, 1, 152, "oil setpoint [m³/h]"),
+            "gas_setpoint": _slider(5000, 17000, 20, 9640, "gas setpoint [m³/h]"),
+            "pressure": _slider(-4, 4, 0.25, 0, "reservoir pressure change [bar]"),
+            "pressure_time": _slider(0, 1790, 10, 900, "from [s]"),
+            "model_choke": _slider(6, 96, 2, 50, "model: choke [%]"),
+            "model_lift": _slider(2500, 9500, 250, 7500, "model: lift [m³/h]"),
+        }
     )
-    model_panel = mo.accordion(
-        {"Disturbance and model": mo.vstack([pressure, pressure_time, model_choke, model_lift], gap=0.4)}
-    )
-    return (
-        gas_setpoint,
-        model_choke,
-        model_lift,
-        model_panel,
-        oil_setpoint,
-        pressure,
-        pressure_time,
-        setpoint_panel,
-    )
+    _sliders = list(scenario.elements.values())
+    setpoint_panel = mo.vstack([mo.md(f"**Setpoints** from {explore.STEP_TIME:g} s"), *_sliders[:2]], gap=0.4)
+    model_panel = mo.accordion({"Disturbance and model": mo.vstack(_sliders[2:], gap=0.4)})
+    return model_panel, scenario, setpoint_panel
 
 
 @app.cell
@@ -164,25 +160,16 @@ def _(choices_panel, length, mo, model_panel, page, setpoint_panel, tuning_panel
 def _(
     InputError,
     blocking,
-    choke_weight,
     compilation_shown,
     compiled_since,
     controller,
     explore,
-    gas_deadzone,
-    gas_setpoint,
-    gas_weight,
     length,
     mo,
-    model_choke,
-    model_lift,
-    oil_deadzone,
-    oil_setpoint,
-    oil_weight,
     preset,
-    pressure,
-    pressure_time,
+    scenario,
     soft,
+    tuning,
 ):
     run, refused = None, None
     try:
@@ -191,18 +178,9 @@ def _(
             preset=preset.value,
             soft=soft.value,
             blocking=blocking.value,
-            choke_weight=choke_weight.value,
-            gas_weight=gas_weight.value,
-            oil_weight=oil_weight.value,
-            gas_deadzone=gas_deadzone.value,
-            oil_deadzone=oil_deadzone.value,
-            model_choke=model_choke.value,
-            model_lift=model_lift.value,
-            gas_setpoint=gas_setpoint.value,
-            oil_setpoint=oil_setpoint.value,
-            pressure=pressure.value,
-            pressure_time=pressure_time.value,
             whole=length.value,
+            **tuning.value,
+            **scenario.value,
         )
         if length.value:
             with (

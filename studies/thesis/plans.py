@@ -12,12 +12,7 @@ import numpy as np
 import xarray as xr
 
 from jaxmpc.errors import InputError
-from studies.definition.presets import CHOKE
-from studies.kpi import loop as kpi
 from studies.store.reading import provenance
-
-SMALLEST_MOVE = 1e-6  # % choke, less is rounding
-LONGEST_SWING = 1000.0  # s
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -86,39 +81,6 @@ def plan_at(data: xr.Dataset, controller: str, time: float) -> StoredPlan:
         cv[i:] += _response(steps, move[i], horizon - i, 0)
     before = run.demand.values[k] - run.move.values[k]
     return StoredPlan(float(times[k]), move, before + np.cumsum(move, axis=0), cv, dt)
-
-
-def oscillation_moves(data: xr.Dataset, controller: str, around: float) -> tuple[float, float, float]:
-    """Times of three choke moves of an oscillation: the first of a swing, of the swing back, and of the one after it.
-
-    A swing is all moves in one direction until the choke turns, often a single move. Swings that begin more than
-    `LONGEST_SWING` after each other are no oscillation.
-
-    Args:
-        data: results from `studies.store.reading.open_results`.
-        controller: name of a finished run.
-        around: the oscillation whose second swing begins nearest to this time is taken [s].
-
-    Returns:
-        Starts of the samples whose moves they are [s].
-
-    Raises:
-        InputError: for an unknown or unfinished controller, and where the choke never oscillates.
-    """
-    run = _finished(data, controller)
-    choke = list(data.mv.values).index(CHOKE)
-    start = run.demand.values[0, choke] - run.move.values[0, choke]
-    moves = np.asarray(kpi.moves_of(run.position.values[:, choke], start))
-    at = np.flatnonzero(np.abs(moves) > SMALLEST_MOVE)
-    turned = np.sign(moves[at[1:]]) != np.sign(moves[at[:-1]])
-    begin = data.time.values[at[np.r_[True, turned][: at.size]]]
-    soon = np.diff(begin) <= LONGEST_SWING
-    middle = 1 + np.flatnonzero(soon[:-1] & soon[1:])
-    if middle.size == 0:
-        raise InputError("controller", controller, "a run in which the choke oscillates")
-    best = middle[np.argmin(np.abs(begin[middle] - around))]
-    first, second, third = begin[best - 1 : best + 2].tolist()
-    return first, second, third
 
 
 def _finished(data: xr.Dataset, controller: str) -> xr.Dataset:
