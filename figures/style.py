@@ -119,6 +119,12 @@ def image(source: bytes, words: str, look: str = "") -> str:
     return f'<img alt="{html.escape(words)}"{look} src="data:image/png;base64,{content}">'
 
 
+def spans(values: np.ndarray, ratio: float) -> bool:
+    """Whether the finite values are positive and the largest is more than `ratio` times the smallest."""
+    finite = values[np.isfinite(values)]
+    return len(finite) > 0 and finite.min() > 0 and finite.max() > ratio * finite.min()
+
+
 def colour(kind: str, actuator: str, position: int = 0) -> str:
     """Colour of a controller; `position` tells further kinds apart."""
     return CONTROLLER_COLOURS.get((kind, actuator), SPARE_COLOURS[position % len(SPARE_COLOURS)])

@@ -153,10 +153,10 @@ def sweep_axes(data: xr.Dataset) -> list[SweepAxis]:
             continue
         if key in ("prediction_horizon", "control_horizon") and _decides(found.get("blocks"), values):
             continue
-        attrs = data[key].attrs
-        if values.dtype.kind == "f" and not np.isfinite(values).all():  # a limit that does not bind
-            values = np.array([f"{value:g}" for value in values], dtype=object)
-        axis = SweepAxis(key, attrs.get("long_name", key), attrs.get("units", ""), values)
+        axis = axis_of(data, key)
+        if axis.numeric and not np.isfinite(values.astype(float)).all():  # a limit that does not bind
+            texts = np.array([f"{value:g}" for value in values], dtype=object)
+            axis = dataclasses.replace(axis, values=texts)
         for i, known in enumerate(out):
             alike = known.numeric == axis.numeric and known.key != "controller"
             if alike and _decides(known.values, values) and _decides(values, known.values):
@@ -165,6 +165,12 @@ def sweep_axes(data: xr.Dataset) -> list[SweepAxis]:
         else:
             out.append(axis)
     return out
+
+
+def axis_of(data: xr.Dataset, key: str) -> SweepAxis:
+    """A column of the study."""
+    attrs = data[key].attrs
+    return SweepAxis(key, attrs.get("long_name", key), attrs.get("units", ""), data[key].values)
 
 
 def _decides(first: np.ndarray | None, second: np.ndarray) -> bool:

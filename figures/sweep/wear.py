@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 
 from figures import style
 from figures.sweep import sheet
-from figures.sweep.data import SweepAxis, deviation, figure_of, load, sweep_axes, thesis_tuning
+from figures.sweep.data import SweepAxis, axis_of, deviation, figure_of, load, sweep_axes, thesis_tuning
 from jaxmpc.errors import InputError
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "d")
@@ -88,8 +88,7 @@ def pareto(
     if mark.any():
         sheet.ring(axes, across[mark], up[mark])
     for values, set_scale in ((across, axes.set_xscale), (up, axes.set_yscale)):
-        finite = values[np.isfinite(values)]
-        if len(finite) and finite.min() > 0 and finite.max() > SPREAD * finite.min():
+        if style.spans(values, SPREAD):
             set_scale("log")
     axes.set_xlabel(x_title)
     axes.set_ylabel(y_title)
@@ -153,8 +152,7 @@ def _pick(data: xr.Dataset, known: list[SweepAxis], key: str) -> SweepAxis:
             return axis
     if key not in data.coords or data[key].dims != ("scenario",):
         raise InputError("color or marker", key, f"a column of the study: {', '.join(a.key for a in known)}")
-    attrs = data[key].attrs
-    return SweepAxis(key, attrs.get("long_name", key), attrs.get("units", ""), data[key].values)
+    return axis_of(data, key)
 
 
 def _marker_axis(known: list[SweepAxis], coloured: SweepAxis | None) -> SweepAxis | None:
@@ -163,15 +161,12 @@ def _marker_axis(known: list[SweepAxis], coloured: SweepAxis | None) -> SweepAxi
     return min(rest, key=lambda a: (a.key != "controller", a.numeric), default=None)
 
 
-def _points(
-    axes: Axes, x: np.ndarray, y: np.ndarray, coloured: SweepAxis | None, shaped: SweepAxis | None
-) -> None:
+def _points(axes: Axes, x, y, coloured: SweepAxis | None, shaped: SweepAxis | None) -> None:
     small = len(x) > MANY
     look: dict[str, Any] = {"s": 14 if small else 34, "linewidth": 0.25 if small else 0.4}
     look |= {"edgecolor": "white", "zorder": 3}
     paints = np.full(len(x), style.BLUE, dtype=object)
-    handles: list[Line2D] = []
-    titles = []
+    handles, titles = [], []
     grey: dict[str, Any] = {"linestyle": "none", "markersize": 6, "markeredgecolor": "white"}
     if coloured is not None and coloured.numeric:
         paints = coloured.values.astype(float)
