@@ -9,6 +9,7 @@ import dataclasses
 import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -180,7 +181,7 @@ def _decides(first: np.ndarray | None, second: np.ndarray) -> bool:
     return len(set(zip(first.tolist(), second.tolist(), strict=True))) == len(set(first.tolist()))
 
 
-def setting(data: xr.Dataset, key: str):
+def setting(data: xr.Dataset, key: str) -> Any:
     """What the base of the study says of a key; its default if the base is silent, None if the store does not know."""
     if key in data.coords:  # an axis of one value
         return data[key].values[0]

@@ -17,6 +17,7 @@ from figures import style
 from figures.sweep import sheet
 from figures.sweep.data import SweepAxis, axis_of, deviation, figure_of, load, sweep_axes, thesis_tuning
 from jaxmpc.errors import InputError
+from studies.kpi.objectives import unbeaten
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "d")
 COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, *style.SPARE_COLOURS)
@@ -28,21 +29,13 @@ SPREAD = 30.0  # largest over smallest value of an axis that is drawn logarithmi
 def front(x, y) -> np.ndarray:
     """Which points no other point beats: as good in both and better in one, smaller being better.
 
-    Equal points do not beat each other. Points with NaN are never on the front and beat nothing.
+    Equal points do not beat each other. Points that are not finite are never on the front and beat nothing.
 
     Args:
         x: ``"point"``.
         y: ``"point"``.
     """
-    x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-    on = np.zeros(len(x), dtype=bool)
-    best_y, best_x = np.inf, np.nan
-    for i in np.lexsort((y, x)):  # by x, then by y; NaN last
-        if np.isnan(x[i]) or np.isnan(y[i]):
-            continue
-        if y[i] < best_y or (y[i] == best_y and x[i] == best_x):
-            on[i], best_y, best_x = True, y[i], x[i]
-    return on
+    return unbeaten(np.column_stack([x, y]).astype(float))
 
 
 @style.house_style

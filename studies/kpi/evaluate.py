@@ -9,14 +9,17 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Array
 
-from jaxmpc.controller.measurement import GOOD
 from jaxmpc.errors import InputError
-from jaxmpc.status import OPTIMAL
 from studies.definition.presets import CHOKE, GAS, LIFT, OIL
 from studies.kpi import loop as kpi
-from studies.kpi.sweep import KPIS, Channels, Run, Tuned, rounding, run_kpis
+from studies.kpi.sweep import KPIS, RECORD, Channels, Run, Tuned, rounding, run_kpis, run_of
 
 NEAR_CLOSED = 50.0  # % choke, the border in the thesis's statement on oscillation
+STORED = {
+    "cv": "measurement",
+    "mv": "position",
+    "mv_demand": "demand",
+}  # what fields of runs are called in results
 
 
 def completed(data: xr.Dataset) -> xr.Dataset:
@@ -64,7 +67,9 @@ def key_figures(data: xr.Dataset) -> xr.Dataset:
         run = data.isel(controller=i)
         tuned = Tuned(*(run[f"tuning_{name}"].values for name in Tuned._fields))
         span = run.mean_move_window.item()
-        row = _figures(_arrays(run), tuned, late, float(data.attrs["dt"]), windows, span, channels)
+        fields = {name: run[STORED.get(name, name)].values for name in RECORD}
+        arrays = run_of(fields, run.setpoint.values, window)
+        row = _figures(arrays, tuned, late, float(data.attrs["dt"]), windows, span, channels)
         rows.append(row | {"wall_time": run.wall_time.values})
     out = {}
     for key, (axes, unit, meaning) in ({k.name: (k.dims, k.unit, k.long_name) for k in KPIS} | _OWN).items():
@@ -75,19 +80,6 @@ def key_figures(data: xr.Dataset) -> xr.Dataset:
     starts = np.array([data.time.values[samples[0]] for samples in _windows(data)])
     coords["window"] = ("window", starts, {"long_name": "start of the setpoint window", "units": "s"})
     return xr.Dataset(out, coords)
-
-
-def _arrays(run: xr.Dataset) -> Run:
-    """A stored run as `run_kpis` takes it."""
-    stored = {"cv": "measurement", "mv": "position", "mv_demand": "demand"}
-    same = ("setpoint", "move", "window", "objective", "gap", "solve_time")
-    return Run(
-        **{name: run[stored.get(name, name)].values for name in (*stored, *same)},
-        optimal=run.status.values == OPTIMAL,
-        fallback=run.fallback.values != 0,
-        left_out=run.quality.values != GOOD,
-        off=run.off.values != 0,
-    )
 
 
 @functools.partial(jax.jit, static_argnames=("windows", "span", "channels"))

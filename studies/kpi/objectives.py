@@ -29,7 +29,7 @@ DEVIATION = "deviation"
 CHANNELS = {(): (), ("cv",): CV_NAMES, ("mv",): MV_NAMES}
 FIGURES = {kpi.name: kpi for kpi in KPIS}
 CLOCK = "solve_time"  # figures of the clock differ from run to run
-THESIS_DEADZONE = tuple(presets.tuning_fields("thesis")["deadzone"][name] for name in CV_NAMES)
+THESIS_DEADZONE = tuple(presets.TUNINGS["thesis"]["deadzone"][name] for name in CV_NAMES)
 DIRECTIONS = ("minimize", "maximize")
 
 
@@ -115,12 +115,12 @@ def unbeaten(values: np.ndarray) -> np.ndarray:
     Args:
         values: ``"point objective"``.
     """
-    finite = np.all(np.isfinite(values), axis=1)
-    out, rivals = finite.copy(), values[finite]
-    for i in np.flatnonzero(finite):
-        as_good, better = (rivals <= values[i]).all(axis=1), (rivals < values[i]).any(axis=1)
-        out[i] = not (as_good & better).any()
-    return out
+    on, rivals = np.zeros(len(values), dtype=bool), values[:0]
+    for i in np.lexsort(values.T[::-1]):  # whoever beats a point comes before it
+        beaten = (rivals <= values[i]).all(axis=1) & (rivals < values[i]).any(axis=1)
+        if np.isfinite(values[i]).all() and not beaten.any():
+            on[i], rivals = True, np.vstack([rivals, values[i]])
+    return on
 
 
 def front(store: str | Path) -> np.ndarray:

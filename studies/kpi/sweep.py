@@ -8,6 +8,7 @@ float, so that a run whose numbers are not all finite can answer NaN instead of 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -191,15 +192,12 @@ def channels_of(batch: TrajectoryBatch) -> Channels:
         InputError: if one is missing, or a rate is not in m3/h.
     """
     found = []
-    for wanted, names, units, key in (
-        (MV_NAMES, batch.mv_names, batch.mv_units, "mv"),
-        (CV_NAMES, batch.cv_names, batch.cv_units, "cv"),
-    ):
+    for key, wanted in (("mv", MV_NAMES), ("cv", CV_NAMES)):
+        names, units = getattr(batch, f"{key}_names"), getattr(batch, f"{key}_units")
         for name in wanted:
             if name not in names:
-                raise InputError(
-                    f"batch.{key}_names", list(names), f"the well's {key.upper()} {name!r} among them"
-                )
+                expected = f"the well's {key.upper()} {name!r} among them"
+                raise InputError(f"batch.{key}_names", list(names), expected)
             at = names.index(name)
             if name != MV_NAMES[0] and units[at] != RATE_UNIT:
                 raise InputError(f"batch.{key}_units[{at}]", units[at], f"{RATE_UNIT!r}, the unit of {name}")
@@ -220,19 +218,22 @@ def runs_of(batch: TrajectoryBatch, window) -> Run:
     shape = (len(batch), len(batch.time))
     labels = np.asarray(window)
     if labels.shape not in (shape, shape[1:]) or not np.issubdtype(labels.dtype, np.integer):
-        raise InputError(
-            "window",
-            f"{labels.dtype} of shape {list(labels.shape)}",
-            f"whole numbers, one per sample [{shape[1]}] or per lane and sample {list(shape)}",
-        )
+        expected = f"whole numbers, one per sample [{shape[1]}] or per lane and sample {list(shape)}"
+        raise InputError("window", f"{labels.dtype} of shape {list(labels.shape)}", expected)
+    fields = {name: batch[name] for name in RECORD}
+    return run_of(fields, batch.setpoint, np.broadcast_to(labels.astype(np.int32), shape))
+
+
+def run_of(fields: Mapping[str, Any], setpoint, window) -> Run:
+    """A run, or many with the lane axis first, from the fields `RECORD` of `Trajectory`."""
     return Run(
-        **{key: np.asarray(batch[key], dtype=np.float64) for key in _NUMBERS},
-        setpoint=np.asarray(batch.setpoint, dtype=np.float64),
-        window=np.broadcast_to(labels.astype(np.int32), shape),
-        optimal=np.asarray(batch["status"]) == OPTIMAL,
-        fallback=np.asarray(batch["fallback"]) != 0,
-        left_out=np.asarray(batch["quality"]) != GOOD,
-        off=np.asarray(batch["off"]) != 0,
+        **{key: np.asarray(fields[key], dtype=np.float64) for key in _NUMBERS},
+        setpoint=np.asarray(setpoint, dtype=np.float64),
+        window=window,
+        optimal=np.asarray(fields["status"]) == OPTIMAL,
+        fallback=np.asarray(fields["fallback"]) != 0,
+        left_out=np.asarray(fields["quality"]) != GOOD,
+        off=np.asarray(fields["off"]) != 0,
     )
 
 
@@ -334,11 +335,9 @@ def batch_kpis(batch: TrajectoryBatch, tunings: Tuning, window, *, tolerance=Non
     channels = channels_of(batch)
     runs = runs_of(batch, window)
     lanes, cvs, mvs = len(batch), len(batch.cv_names), len(batch.mv_names)
+    sizes = {name: (cvs if name in PER_CV else mvs,) for name in Tuned._fields}
     each = Tuned(
-        *(
-            _per_lane(f"tunings.{name}", getattr(tunings, name), lanes, (cvs if name in PER_CV else mvs,))
-            for name in Tuned._fields
-        )
+        *(_per_lane(f"tunings.{name}", getattr(tunings, name), lanes, size) for name, size in sizes.items())
     )
     allowed = each.deadzone
     if tolerance is not None:
@@ -353,11 +352,8 @@ def _per_lane(field: str, given, lanes: int, size: tuple[int, ...]) -> Any:
     """One value of the given size for each lane, from one per lane or one for all."""
     value = np.asarray(given)
     if value.shape not in (size, (lanes, *size)):
-        raise InputError(
-            field,
-            f"shape {list(value.shape)}",
-            f"shape {[lanes, *size]}, one per lane, or {list(size)} for all",
-        )
+        expected = f"shape {[lanes, *size]}, one per lane, or {list(size)} for all"
+        raise InputError(field, f"shape {list(value.shape)}", expected)
     return np.broadcast_to(value, (lanes, *size))
 
 
