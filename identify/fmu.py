@@ -93,9 +93,7 @@ def _compiler() -> str | None:
 
 
 def _cmake_options() -> dict[str, str]:
-    if os.name != "posix":
-        return {}
-    return {
+    options = {
         "CMAKE_C_FLAGS:STRING": COMPILER_FLAGS,
         "CMAKE_C_STANDARD_LIBRARIES:STRING": "-lm",
         # FMPy's project asks for a C++ compiler too and never uses it: any path that needs no check will do.
@@ -103,6 +101,7 @@ def _cmake_options() -> dict[str, str]:
         "CMAKE_CXX_COMPILER_WORKS:BOOL": "TRUE",
         "CMAKE_CXX_COMPILER_FORCED:BOOL": "TRUE",
     }
+    return options if os.name == "posix" else {}
 
 
 def _tools() -> dict[str, str]:
