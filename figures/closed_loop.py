@@ -68,15 +68,9 @@ def tracking(
     legend: bool = True,
     bins: int = 12,
 ) -> None:
-    """CVs with setpoint and deadzone, then MVs, the choke with what was demanded; a pinned run in grey behind.
+    """CVs with setpoint and deadzone, then MVs, the choke with what was demanded, a panel each; a pinned run in grey behind.
 
-    Args:
-        axes: one panel per CV and MV.
-        data: results.
-        controller: name of a run in them.
-        pinned: results of one controller `RUN` to compare with; only times of `data` are drawn.
-        legend: whether panels have legends of their own.
-        bins: numbers along a time axis, at most.
+    Of `pinned`, results of one controller `RUN`, only times of `data` are drawn. A time axis has at most `bins` numbers.
     """
     start, end = panels.span(data)
     cvs = panels.cv_names(data)

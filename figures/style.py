@@ -67,14 +67,7 @@ house_style = matplotlib.rc_context(RC)  # a decorator of what draws or writes
 
 
 def figure(rows: int, width: float = 7.6, row_height: float = 2.2, **options) -> tuple[Figure, list[Axes]]:
-    """A figure of stacked panels that share their horizontal axis.
-
-    Args:
-        rows: number of panels.
-        width: of the figure [inch].
-        row_height: of one panel [inch].
-        **options: for `matplotlib.figure.Figure.subplots`.
-    """
+    """A figure of stacked panels that share their horizontal axis; width of the figure and height of a panel [inch]."""
     drawn, axes = grid(rows, 1, width, row_height * rows + 0.5, **{"sharex": True, **options})
     return drawn, list(axes[:, 0])
 

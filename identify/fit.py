@@ -172,14 +172,10 @@ def _measure(x, u, parameters):
 
 
 def simulate_steps(parameters: WellParameters, x0, point, seconds: int, samples: int):
-    """Step responses as a differentiable function of the parameters.
+    """Step responses as a differentiable function of the parameters of the well.
 
-    Args:
-        parameters: of the well.
-        x0: ``"8"``, its steady state at the working point.
-        point: ``"2"``, working point: choke [%] and lift [m3/h].
-        seconds: sampling interval [s].
-        samples: number of coefficients.
+    They begin in the steady state `x0` ``"8"`` at the working point ``"2"``, choke [%] and lift [m3/h]; a sample is a
+    whole number of seconds.
 
     Returns:
         ``(steady, response)``: steady CVs ``"cv"`` [m3/h], and S(1)..S(samples) ``"cv mv n"``.

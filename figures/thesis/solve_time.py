@@ -85,11 +85,7 @@ def draw_benchmark(results: str | Path | dict[str, Any], out: str | Path) -> lis
 
 
 def time_per_sample(runs: list[tuple[str, str, np.ndarray]]) -> Figure:
-    """One panel per run: solve time of every sample, its median, and the value that 99 % stay below.
-
-    Args:
-        runs: kind of the controller, blocking mode, and the times ``"sample"`` [ms].
-    """
+    """One panel per run of `_timed`: solve time of every sample, its median, and the value that 99 % stay below."""
     drawn, axes = style.figure(len(runs), row_height=1.9, sharey=True)
     for ax, (kind, mode, milliseconds) in zip(axes, runs, strict=True):
         hours = np.arange(len(milliseconds)) * DT_HOURS
@@ -115,8 +111,7 @@ def two_digits(value: float) -> str:
 def rate_over_batch(series: dict[str, Any]) -> Figure:
     """Relaxed QPs per second over batch size, with and without a start, and the rate of the peer beside it.
 
-    Args:
-        series: of the results; ``batch MODE`` has ``batch``, ``warm``, ``cold`` and perhaps a peer's rate.
+    Of the series, ``batch MODE`` has ``batch``, ``warm``, ``cold`` and perhaps a peer's rate.
     """
     modes = [mode for mode in MODES if f"batch {mode}" in series]
     drawn, axes = style.figure(len(modes), width=6.0, row_height=2.6, sharey=True)

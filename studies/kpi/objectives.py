@@ -111,9 +111,7 @@ def unbeaten(values: np.ndarray) -> np.ndarray:
     """Which points no other point beats: as good in everything and better in something, smaller being better.
 
     Equal points do not beat each other; points with a value that is not finite are never among them and beat nothing.
-
-    Args:
-        values: ``"point objective"``.
+    Values are ``"point objective"``.
     """
     on, rivals = np.zeros(len(values), dtype=bool), values[:0]
     for i in np.lexsort(values.T[::-1]):  # whoever beats a point comes before it
@@ -124,10 +122,7 @@ def unbeaten(values: np.ndarray) -> np.ndarray:
 
 
 def front(store: str | Path) -> np.ndarray:
-    """Numbers of the stored scenarios that no other beats, the best in the first objective first.
-
-    Args:
-        store: of a search, complete or not.
+    """Numbers of the scenarios that no other beats in the store of a search, the best in the first objective first.
 
     Raises:
         InputError: if there is no store, or it is not that of a search.

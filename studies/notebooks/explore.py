@@ -27,9 +27,10 @@ def _(mo):
 
     # Ratios to the preset's own value, so that one slider serves values of any size.
     RATIOS = [2.0**k for k in range(-5, 6)]
+    SLIDER = {"show_value": True, "debounce": True, "full_width": True}
     _request = mo.app_meta().request
     given_store = str(_request.meta.get("store", "")) if _request is not None else ""
-    return InputError, RATIOS, draw, explore, given_store, html, presets
+    return InputError, RATIOS, SLIDER, draw, explore, given_store, html, presets
 
 
 @app.cell
@@ -92,19 +93,12 @@ def _(explore, mo, presets):
 
 
 @app.cell
-def _(RATIOS, mo, preset, presets):
+def _(RATIOS, SLIDER, mo, preset, presets):
     _fields = presets.TUNINGS[preset.value]
 
     def _slider(label, value, unit, steps=None):
         steps = steps or [float(f"{ratio * value:.4g}") for ratio in RATIOS]
-        return mo.ui.slider(
-            steps=steps,
-            value=value,
-            label=f"{label} [{unit}]",
-            show_value=True,
-            debounce=True,
-            full_width=True,
-        )
+        return mo.ui.slider(steps=steps, value=value, label=f"{label} [{unit}]", **SLIDER)
 
     tuning = mo.ui.dictionary(
         {
@@ -124,11 +118,9 @@ def _(RATIOS, mo, preset, presets):
 
 
 @app.cell
-def _(explore, mo):
+def _(SLIDER, explore, mo):
     def _slider(start, stop, step, value, label):
-        return mo.ui.slider(
-            start, stop, step, value=value, label=label, show_value=True, debounce=True, full_width=True
-        )
+        return mo.ui.slider(start, stop, step, value=value, label=label, **SLIDER)
 
     scenario = mo.ui.dictionary(
         {
@@ -204,11 +196,9 @@ def _(
 
 
 @app.cell
-def _(length, mo):
+def _(SLIDER, length, mo):
     _last = 77990 if length.value else 1790
-    plan_time = mo.ui.slider(
-        0, _last, 10, value=300, label="plan made at [s]", show_value=True, debounce=True, full_width=True
-    )
+    plan_time = mo.ui.slider(0, _last, 10, value=300, label="plan made at [s]", **SLIDER)
     return (plan_time,)
 
 
