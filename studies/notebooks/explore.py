@@ -216,16 +216,12 @@ def _(draw, explore, get_pinned, html, mo, page, pin, refused, run, unpin):
             return refused
         pinned = get_pinned()
         figure = draw.tracking(run.data, pinned=None if pinned is None else pinned.data)
-        now = explore.shown_figures(run)
-        before = explore.shown_figures(pinned) if pinned is not None else [(*row[:2], None) for row in now]
-        rows = []
-        for (words, unit, value), (_, _, old) in zip(now, before, strict=True):
-            number, shown = explore.written(value, unit)
-            other = [explore.written(old, unit)] if old is not None else []
-            rows.append(
-                [words, number, *(" ".join(pair) if pair[1] != shown else pair[0] for pair in other), shown]
-            )
-        head = ["", "now", *(["pinned"] if pinned is not None else []), ""]
+        rows, runs = [], [run] if pinned is None else [run, pinned]
+        for figures in zip(*map(explore.shown_figures, runs), strict=True):
+            (now, shown), *before = (explore.written(value, unit) for _, unit, value in figures)
+            old = (number if unit == shown else f"{number} {unit}" for number, unit in before)
+            rows.append([figures[0][0], now, *old, shown])
+        head = ["", *("now", "pinned")[: len(runs)], ""]
         side = [
             mo.Html(
                 '<div id="key-figures" style="font-size:12px;line-height:1.3;white-space:nowrap">'
