@@ -1,4 +1,4 @@
-"""Time of compiled calls, without what their first calls take to compile."""
+"""Time of compiled calls and of bars, without what first calls take to compile."""
 
 from __future__ import annotations
 

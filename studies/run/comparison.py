@@ -29,7 +29,7 @@ from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.problem.tuning import Tuning
-from jaxmpc.programs.compilation import compiled_since
+from jaxmpc.programs.clock import Clock
 from studies.definition.comparison import ComparisonDefinition, ControllerDefinition
 from studies.store.files import FORMAT, RESULTS, open_manifest, survey
 from studies.store.fingerprint import content_hash, source_hash, versions
@@ -204,13 +204,12 @@ def progress_bar(label: str, show: bool) -> Iterator[Callable[[int, int], None]]
     """A progress callback ``(done, total)`` that shows samples, rate and time left, compilation not counted."""
     often = 0.5 if sys.stderr.isatty() else 10.0  # s; a log file needs no more
     with tqdm(desc=label, unit=" samples", disable=not show, dynamic_ncols=True, mininterval=often) as bar:
-        compiled = compiled_since()
+        clock = Clock()
 
         def report(done: int, total: int) -> None:
             if show:
-                seconds = compiled()
-                bar.start_t += seconds
-                bar.last_print_t += seconds
+                bar.start_t = bar._time() - clock.seconds
+                bar.last_print_t = max(bar.last_print_t, bar.start_t)
             bar.total = total
             bar.update(done - bar.n)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from jaxmpc.programs.compilation import clock
+from jaxmpc.programs.clock import Clock
 from studies.definition.estimate import Pace, Work, readable
 
 LAYOUT = "{l_bar}{bar}| {n_fmt}/{total_fmt} scenarios [{elapsed}{postfix}]"
@@ -22,7 +22,7 @@ class Progress:
     def __init__(self, bar: tqdm, pace: Pace):
         """Use `progress_bar`."""
         self._bar, self._pace = bar, pace
-        self._begin, self._scenarios = clock(), 0
+        self._clock, self._scenarios = Clock(), 0
 
     def add(self, chunk: int, facts: Mapping[str, Any], scenarios: int, more: str = "") -> None:
         """A chunk was computed.
@@ -35,8 +35,7 @@ class Progress:
         """
         self._pace.add(chunk, facts)
         self._scenarios += scenarios
-        passed = max(clock() - self._begin, 1e-9)
-        words = [f"{self._scenarios / passed:.3g} per second", more]
+        words = [f"{self._scenarios / max(self._clock.seconds, 1e-9):.3g} per second", more]
         left = self._pace.left
         if not math.isnan(left) and left > 0:
             words.insert(0, f"about {readable(left)} left")
