@@ -1,7 +1,7 @@
 """Computing the scenarios of a sweep study: one chunk in, arrays out. `run_chunk` is all that any executor calls.
 
 A chunk is a pure function of the prepared study and its number; nothing is read or written. All chunks of a group have one
-shape and share one compiled program: the last one is filled up with copies of its last scenario.
+shape: the last one is filled up with copies of its last scenario.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import dataclasses
 import datetime
 import os
 import platform
-import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -24,10 +23,10 @@ from jaxmpc.files import strict_json
 from jaxmpc.loop.simulate import simulate_batches
 from jaxmpc.loop.trajectory import TrajectoryBatch
 from jaxmpc.model.step_response import StepResponseModel
-from jaxmpc.problem.layout import Size
 from jaxmpc.problem.tuning import stack_tunings
 from jaxmpc.process.plant import WellPlant
 from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS
+from jaxmpc.programs.clock import Clock
 from jaxmpc.programs.lanes import Lanes
 from studies.definition.models import Point, identify_models
 from studies.definition.scenarios import Scenario, Study
@@ -56,7 +55,7 @@ class ChunkResult:
     Attributes:
         index: of the chunk.
         fields: every stored variable, ``"lane ..."``, real lanes only.
-        facts: JSON-like: ``wall_time`` [s] and where it was computed.
+        facts: JSON-like: ``wall_time`` [s], compilation left out, and where it was computed.
     """
 
     index: int
@@ -70,9 +69,6 @@ def prepare_study(study: Study, progress: Callable[[int, int], None] | None = No
     return PreparedStudy(study, {point: jax.tree.map(np.asarray, model) for point, model in models.items()})
 
 
-_program_before: list[tuple] = []  # the one of the last chunk in this process
-
-
 def run_chunk(prepared: PreparedStudy, index: int) -> ChunkResult:
     """Run the closed loops of a chunk.
 
@@ -83,13 +79,6 @@ def run_chunk(prepared: PreparedStudy, index: int) -> ChunkResult:
     study = prepared.study
     chunk = study.chunks[index]
     group, lanes = study.groups[chunk.group], study.lanes(chunk.group)
-    size = Size.of(group.structure, max(model.samples for model in prepared.models.values()))
-    own = group.kind, group.actuator, size, group.samples, group.has_limits, group.whole_steps
-    program = *own, group.switching, lanes
-    if _program_before != [program]:
-        if _program_before:
-            jax.clear_caches()  # those of a dozen groups do not fit side by side
-        _program_before[:] = [program]
     fields, facts = run_scenarios(
         [study.scenario(int(k)) for k in chunk.scenarios],
         prepared.models,
@@ -129,7 +118,7 @@ def run_scenarios(
     Returns:
         ``(fields, facts)`` as in `ChunkResult`.
     """
-    begin = time.perf_counter()
+    clock = Clock()
     filled = [*scenarios, *([scenarios[-1]] * (lanes - len(scenarios)))]
     first = filled[0]
     tunings = [s.tuning for s in filled]
@@ -161,7 +150,7 @@ def run_scenarios(
         lanes_at_once=lanes,
     )
     (batch,) = batches
-    simulated = time.perf_counter()
+    simulated = clock.seconds
     windows = np.stack([s.reference.window(s.structure.dt, s.samples) for s in filled])
     figures = batch_kpis(batch, stack_tunings(tunings), windows, tolerance=np.array(SETTLED))
     fields = {name: values[: len(scenarios)] for name, values in figures.items()}
@@ -169,8 +158,8 @@ def run_scenarios(
     for field in trajectories:
         fields[swept(field).name] = _kept(batch, field, len(scenarios), every, points)
     facts = {
-        "wall_time": time.perf_counter() - begin,
-        "simulation_time": simulated - begin,
+        "wall_time": clock.seconds,
+        "simulation_time": simulated,
         "lanes": lanes,
         "scenarios": len(scenarios),
         "device": jax.devices()[0].device_kind,

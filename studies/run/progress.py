@@ -19,10 +19,10 @@ LAYOUT = "{l_bar}{bar}| {n_fmt}/{total_fmt} scenarios [{elapsed}{postfix}]"
 class Progress:
     """A bar that is told of every chunk."""
 
-    def __init__(self, bar: tqdm, pace: Pace):
+    def __init__(self, bar: tqdm, work: Work, done: Mapping[int, Mapping[str, Any]]):
         """Use `progress_bar`."""
-        self._bar, self._pace = bar, pace
-        self._clock, self._scenarios = Clock(), 0
+        self._bar, self._clock, self._scenarios = bar, Clock(), 0
+        self._pace = Pace(work, done, lambda: self._clock.seconds)
 
     def add(self, chunk: int, facts: Mapping[str, Any], scenarios: int, more: str = "") -> None:
         """A chunk was computed.
@@ -68,4 +68,4 @@ def progress_bar(
         mininterval=often,
     ) as bar:
         bar.set_postfix_str("compiles what is new to this machine; time left is known after the first chunk")
-        yield Progress(bar, Pace(work, done))
+        yield Progress(bar, work, done)

@@ -126,9 +126,7 @@ def check_one_group(study: Study, parameters: Sequence[Parameter], points: Seque
         return
     first, other = (points[int(group.scenarios[0])] for group in study.groups[:2])
     differ = [a for a in range(len(parameters)) if first[a] != other[a]]
-    expected = (
-        "values that share one compiled program: the same limits finite, as many whole steps in a choke move"
-    )
+    expected = "values that share one compiled program: the same limits finite"
     raise InputError(
         " with ".join(parameters[a].place for a in differ),
         ", ".join(
