@@ -19,8 +19,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmpc.check import check_keys
 from jaxmpc.errors import InputError
-from jaxmpc.files import check_target
+from jaxmpc.files import check_target, read_json
 from jaxmpc.model.step_response import FORMAT, StepResponseModel, make_model
 from jaxmpc.process.plant import STATE_SCALE, JaxOps, check_inputs, rates, runge_kutta, steady_state
 from jaxmpc.process.well.equations import (
@@ -119,19 +120,14 @@ def load_step_data(path: str | Path) -> StepData:
     Raises:
         InputError: naming the field that is wrong.
     """
-    try:
-        body = json.loads(Path(path).read_text())
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError("step-response file", str(path), f"a readable JSON file ({error})") from error
+    body = read_json("step-response file", path)
     if not isinstance(body, dict):
         raise InputError("step-response file", str(path), "a JSON object")
     if body.get("format") == FORMAT:
         table = StepResponseModel.load(path)
         point, coefficients = dict(table.working_point), np.asarray(table.coefficients)
     else:
-        for key in ("coefficients", "sampling_seconds", "cv", "mv"):
-            if key not in body:
-                raise InputError(f"data.{key}", "nothing", "a value (the key is missing)")
+        check_keys("data", body, ("coefficients", "sampling_seconds", "cv", "mv"))
         table = make_model(
             body["coefficients"], body["sampling_seconds"], body["cv"], body["mv"], path="data"
         )

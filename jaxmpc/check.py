@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Container, Iterable
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -20,6 +23,24 @@ def check_vector(path: str, value: ArrayLike, names: tuple[str, ...], unit: str)
             f"{len(names)} finite numbers of size {LARGEST:g} at most [{unit}] for {', '.join(names)}",
         )
     return array
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is a finite number; true and false are none."""
+    number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+    return number and bool(-np.inf < value < np.inf)
+
+
+def is_count(value: Any) -> bool:
+    """Whether it is a whole number, 1 or more."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= 1)
+
+
+def check_keys(path: str, body: Container, keys: Iterable[str]) -> None:
+    """Refuse a JSON object without one of the keys."""
+    for key in keys:
+        if key not in body:
+            raise InputError(f"{path}.{key}", "nothing", "a value (the key is missing)")
 
 
 def sound(values: np.ndarray) -> np.ndarray:

@@ -136,9 +136,6 @@ _UNIT = {
 def load_case(path: str | Path) -> Case:
     """Read a case file.
 
-    Args:
-        path: JSON file with the fields of `Case`.
-
     Raises:
         InputError: for a file that cannot be read, text that is not JSON, and everything `make_case` refuses.
     """
@@ -161,9 +158,6 @@ def load_case(path: str | Path) -> Case:
 
 def make_case(body: Any) -> Case:
     """Check a decoded case file.
-
-    Args:
-        body: nested dictionaries and lists, as JSON decodes them.
 
     Returns:
         The case, with infinite limits where the file has null.

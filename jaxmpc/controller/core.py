@@ -119,6 +119,27 @@ class Moment(NamedTuple):
     unit: Float[Array, ""]
     recovering: Bool[Array, ""]
 
+    @property
+    def good(self) -> Bool[Array, ""]:
+        """Whether the compiled program has closed it."""
+        return self.decision.closed & (abs(self.decision.x) < np.inf).all(axis=-1)
+
+    def said(self, whole: Bool[Array, ""]) -> dict[str, Array]:
+        """What the decision says of itself, by the names of `StepInfo` and `Trajectory`; `whole`: of whole moves."""
+        found, sensors, good = self.decision, self.state.sensors, self.good
+        certified = lambda value: jnp.where(good, value, jnp.nan)  # noqa: E731
+        return dict(
+            status=jnp.where(good, codes.OPTIMAL, codes.FAILED),
+            fallback=~good,
+            quality=sensors.quality,
+            off=sensors.off,
+            objective=certified(found.value),
+            bound=certified(found.bound),
+            gap=certified(relative_gap(found.value, found.bound, self.unit)),
+            nodes=jnp.where(whole, found.nodes, found.steps),
+            finished_by=jnp.where(good, found.finished_by, 0),
+        )
+
 
 class Core(eqx.Module):
     """Everything of a controller that stays the same from sample to sample, as arrays of a size.
@@ -142,12 +163,7 @@ class Core(eqx.Module):
     switching: bool = eqx.field(static=True)
 
     def init(self, cv: Float[Array, " cv"], mv: Float[Array, " mv"]) -> ControllerState:
-        """State of a controller that starts in a steady state.
-
-        Args:
-            cv: measured CVs [CV unit].
-            mv: present MVs [MV unit].
-        """
+        """State of a controller that starts in a steady state."""
         s, zeros = self.size, lambda *shape: jnp.zeros(shape)
         cv, mv = jnp.asarray(cv, dtype=jnp.float64), jnp.asarray(mv, dtype=jnp.float64)
         state = ControllerState(
@@ -172,7 +188,6 @@ class Core(eqx.Module):
         """Predict from where the actuators stand, as if they had moved there in place of the last move.
 
         Args:
-            state: from `init` or `remember`.
             mv: ``"mv"``, positions now [MV unit]; not a number where the demand counts as followed.
             manual: ``"mv"``, MVs that somebody else moves.
 
@@ -206,9 +221,7 @@ class Core(eqx.Module):
         """Compare a measurement with its prediction, update the bias, and move on to the next sample.
 
         Args:
-            state: from `init` or `remember`; its future starts at the present sample.
             cv: measurement now [CV unit]; a bad one leaves the bias to itself.
-            mv, manual: as in `locate`.
 
         Returns:
             ``(state, free_response)``: the future now starts at the next sample; Lambda (5.13) at j = 1, 2, ....
@@ -281,9 +294,6 @@ class Core(eqx.Module):
         """Observe, pose and decide a sample.
 
         Args:
-            state: before it.
-            sample: what is known.
-            gap: relative gap at which whole moves are optimal.
             search: whether whole moves may be searched for here; otherwise none but the relaxation is solved.
         """
         state, free_response = self.observe(state, sample.cv, sample.mv, sample.manual)
@@ -299,11 +309,6 @@ class Core(eqx.Module):
         self, moment: Moment, x: Float[Array, " n"], good: Bool[Array, ""]
     ) -> tuple[ControllerState, Float[Array, "block mv"]]:
         """Apply the first moves of a plan; the MVs are held where there is none.
-
-        Args:
-            moment: the sample.
-            x: the plan.
-            good: whether there is one.
 
         Returns:
             ``(state, planned moves)``: predictions, history, and plan and prices shifted by one sample.
@@ -321,9 +326,7 @@ class Core(eqx.Module):
         """The state after moves of which the first was made: predictions, history, plan and prices of the next sample.
 
         Args:
-            state: from `observe`.
             moves: the plan [MV unit], padded.
-            warm: of its relaxation.
         """
         move = moves[0]
         return ControllerState(
@@ -355,27 +358,9 @@ class Core(eqx.Module):
 
     def conclude(self, moment: Moment) -> tuple[ControllerState, StepInfo]:
         """Carry out what the compiled program decided; the MVs are held where it left something open."""
-        found = moment.decision
-        good = found.closed & jnp.all(jnp.isfinite(found.x))
-        state, moves = self.carry_out(moment, found.x, good)
-        certified = lambda value: jnp.where(good, value, jnp.nan)  # noqa: E731
-        info = StepInfo(
-            move=moves[0],
-            mv=state.mv,
-            moves=moves,
-            status=jnp.where(good, codes.OPTIMAL, codes.FAILED),
-            fallback=~good,
-            recovering=moment.recovering,
-            quality=state.sensors.quality,
-            off=state.sensors.off,
-            objective=certified(found.value),
-            bound=certified(found.bound),
-            gap=certified(relative_gap(found.value, found.bound, moment.unit)),
-            nodes=jnp.where(self.tables.count == 0, found.steps, found.nodes),
-            finished_by=jnp.where(good, found.finished_by, 0),
-            solve_time=jnp.asarray(jnp.nan),
-        )
-        return state, info
+        state, moves = self.carry_out(moment, moment.decision.x, moment.good)
+        own: dict[str, Any] = dict(move=moves[0], mv=state.mv, moves=moves, solve_time=jnp.asarray(jnp.nan))
+        return state, StepInfo(**own, recovering=moment.recovering, **moment.said(self.tables.count > 0))
 
 
 def outside_limits(tuning: Tuning, mv: Float[Array, " mv"]) -> Bool[Array, ""]:

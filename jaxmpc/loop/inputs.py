@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.controller import Batch, Controller, Controllers
 from jaxmpc.errors import InputError
 from jaxmpc.loop.compiled import Inputs
 from jaxmpc.loop.noise import check_deviation, check_seed, errors_of
@@ -58,7 +58,7 @@ def check_faults(faults: np.ndarray, *shapes: tuple[int, ...]) -> None:
 class Sweep:
     """All lanes of a sweep on the host, checked."""
 
-    controllers: Controllers
+    controllers: Batch
     plants: Lanes[WellPlant]
     setpoints: Sequence[np.ndarray]  # one for all, or one per lane
     offsets: np.ndarray  # "sample" or "lane sample"
@@ -136,7 +136,7 @@ class Sweep:
             count=count,
         )
 
-    def controllers_of(self, index: np.ndarray) -> Controllers:
+    def controllers_of(self, index: np.ndarray) -> Batch:
         """The controllers of some lanes."""
         if self.controllers.count == 1:
             return self.controllers.repeated(len(index))

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.controller import Batch, Controller, Controllers
 from jaxmpc.errors import InputError
 from jaxmpc.loop.compiled import Inputs, simulate_compiled
 from jaxmpc.loop.host import simulate_on_host
@@ -52,13 +52,11 @@ def simulate(
     """Close the loop from the plant's steady state at its default working point.
 
     Args:
-        controller: with whole moves or without.
         plant: `WellPlant`, or a stateful plant with `init()`, `step(mv, disturbance)` and `dt`, such as the FMU's.
         reference: setpoints, covering the run.
         samples: length of the run; the whole reference if not given.
         disturbance: reservoir-pressure offset per sample [bar], ``"sample"``; none if not given.
         noise: standard deviation of the measurement noise, ``"cv"`` [CV unit]; none if not given.
-        seed: of the noise.
         faults: errors of failing sensors ``"sample cv"``, from `measurement.fault_errors`; none if not given.
         position_feedback: whether the controller is told where the actuators stand, and predicts from there.
         changes: times [s] and controllers of equal structure that take over then, with the state of the one before.
@@ -103,7 +101,7 @@ def simulate(
     return Trajectory(setpoint=setpoints, **record, **kept, **_labels(structure, len(setpoints)))
 
 
-def _one_lane(controllers: Controllers, plant, inputs: Inputs, record, progress: Progress | None):
+def _one_lane(controllers: Batch, plant, inputs: Inputs, record, progress: Progress | None):
     """A compiled loop of one controller."""
     done, total = 0, inputs.setpoints.shape[1]
 
@@ -179,9 +177,6 @@ def simulate_batches(
         lanes_at_once: lanes of one piece; fewer where the lanes then divide evenly. Each size compiles once.
         devices: to spread the lanes over; all of this process if not given.
         progress: called with ``(done, total)`` samples of all lanes, first when compilation is over.
-
-    Returns:
-        Iterator of `TrajectoryBatch`, in lane order.
 
     Raises:
         InputError: at once, for what `simulate` refuses, lane counts that differ, or no lanes at all.

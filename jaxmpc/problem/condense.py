@@ -155,9 +155,7 @@ def dynamic_matrix(
     """Theta of (5.4c) after blocking [CV unit per MV unit].
 
     Args:
-        layout: blocks.
         coefficients: S(1)..S(N); S keeps its last value beyond N.
-        j: samples of the predictions.
     """
     # a block of equal moves responds with the sum of delayed steps, S(0) = 0
     longest = j.shape[0] + coefficients.shape[-1]
@@ -193,8 +191,6 @@ def matrices_of(
     """The matrices that all tunings of a structure and model share.
 
     Args:
-        layout: the structure.
-        size: of its arrays.
         coefficients: step-response coefficients [CV unit per MV unit].
         summed: whether to keep the running sums of the responses (up to `SUMMED_BYTES`), which make a Newton
             step several times as fast; they take longer to make than one step takes.
@@ -225,10 +221,6 @@ def condense(
     """Build the constant part of the condensed problem (5.8)-(5.13), (6.6).
 
     Args:
-        layout: the structure.
-        size: of its arrays.
-        tuning: weights and limits in engineering units.
-        matrices: of the structure and the model.
         envelope: largest whole number of steps an integer move can make, for the envelope of its weight; 0 keeps the
             plain square.
         has_limits: whether any CV limit is finite (static; False drops their rows from the solver).

@@ -63,9 +63,7 @@ class Declared:
         """Checked values in the order of `names`; of one number where the field has one for all.
 
         Args:
-            path: of the field, for errors.
             given: a vector, a mapping from name to value, or one value for all; None is infinite where that is allowed.
-            names: of the CVs or MVs.
 
         Raises:
             InputError: with the path, the value, what was expected and the unit.
@@ -129,10 +127,6 @@ def declare(
     """A field with its declaration.
 
     Args:
-        unit: see `Declared`, as for the three that follow.
-        meaning: in few words.
-        note: what else there is to know.
-        equation: of the thesis.
         preset: what an object has that is made without the field; none where arrays have to be made for it.
         **more: of `Declared`; without a default, what may be infinite is so.
     """

@@ -50,10 +50,6 @@ def make_instance(
     """The problem of one sample.
 
     Args:
-        layout: the structure.
-        size: of its arrays.
-        tuning: limits in engineering units.
-        qp: the constant part.
         free_response: Lambda at j = 1, 2, ..., bias included [CV unit].
         setpoint: r at j = 1, 2, ... [CV unit].
         mv_now: MVs before the move [MV unit].

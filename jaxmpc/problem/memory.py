@@ -45,7 +45,6 @@ def check_ranges(structure: Structure, lower: np.ndarray, upper: np.ndarray) -> 
     """Refuse ranges of whole moves that a search cannot list.
 
     Args:
-        structure: names the integer MVs.
         lower, upper: limits ``"scenario integer"`` of all whole moves [steps], MV after MV.
 
     Raises:

@@ -18,6 +18,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxmpc.check import is_number
 from jaxmpc.errors import InputError
 from jaxmpc.process.actuator import check_actuator, move_choke
 from jaxmpc.process.well.equations import (
@@ -231,7 +232,7 @@ class WellPlant(eqx.Module):
     def __check_init__(self):
         for name in ("dt", "substep"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < np.inf:
+            if not is_number(value) or value <= 0:
                 raise InputError(f"plant.{name}", value, "a positive number of seconds")
         if abs(self.dt / self.substep - self.steps) > 1e-9 or self.steps < 1:
             raise InputError("plant.dt", self.dt, f"a whole number of substeps of {self.substep} s")
@@ -268,7 +269,6 @@ class WellPlant(eqx.Module):
         """One sample: move the actuators, hold the inputs for `dt`, and measure at the end.
 
         Args:
-            state: before the sample.
             mv: choke demand [%] (limited to 0..100 by the choke) and lift demand [m3/h] (0 or more).
             disturbance: offset of the reservoir pressure during the sample [bar].
 
@@ -294,7 +294,6 @@ class WellPlant(eqx.Module):
         """Apply a sequence of inputs, one row per sample.
 
         Args:
-            state: before the first sample.
             mv: ``"sample 2"``, choke [%] and lift [m3/h] demands.
             disturbance: one offset [bar], or one per sample.
 

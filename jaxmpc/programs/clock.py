@@ -23,7 +23,7 @@ def _heard(event: str, duration_secs: float, **_: Any) -> None:
     if event.startswith("/jax/core/compile"):
         begin = time.perf_counter() - duration_secs
         while _here.parts and _here.parts[-1][0] >= begin:  # a part of this one, which ends later
-            _, _here.seconds = _here.parts.pop()
+            _here.seconds = _here.parts.pop()[1]
         _here.parts.append((begin, _here.seconds))
         _here.seconds += duration_secs
 

@@ -40,13 +40,8 @@ class Lanes(eqx.Module, Generic[T]):
 
     @property
     def value(self) -> T:
-        """The `T` whose arrays have a lane axis where `axes` says so; what `jax.vmap` takes."""
+        """The `T` whose arrays have a lane axis where `each` has them."""
         return eqx.combine(self.each, self.shared)
-
-    @property
-    def axes(self) -> T:
-        """``in_axes`` of `value` for `jax.vmap` and `eqx.filter_vmap`: 0 for a lane axis, None for none."""
-        return jax.tree.map(lambda _: 0, self.each)
 
     def lane(self, k: int) -> T:
         """The `T` of lane k alone."""

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxmpc.check import check_keys
 from jaxmpc.errors import InputError
-from jaxmpc.files import write_atomically
+from jaxmpc.files import read_json, write_atomically
 
 FORMAT = "jaxmpc/steady-map/1"
 INSIDE = 1e-9  # barycentric coordinate down to which a point belongs to a triangle
@@ -118,12 +119,7 @@ class SteadyMap:
         return np.flatnonzero(np.isnan(self.values).any(axis=1))
 
     def interpolate(self, choke, lift) -> Float[np.ndarray, "cv ..."]:
-        """CVs between the grid points, linear over the triangles; NaN outside of them.
-
-        Args:
-            choke: positions [%], any shape.
-            lift: rates [m3/h], a shape that goes with it.
-        """
+        """CVs at positions [%] and lift rates [m3/h] of any shape, linear over the triangles; NaN outside of them."""
         choke, lift = np.broadcast_arrays(np.asarray(choke, np.float64), np.asarray(lift, np.float64))
         triangles, values = self.triangles, self.values
         out = np.full((choke.size, len(self.cv_names)), np.nan)
@@ -152,15 +148,10 @@ class SteadyMap:
     @classmethod
     def load(cls, path: str | Path) -> SteadyMap:
         """Read a map written by `save`. Raises `InputError` naming the field that is wrong."""
-        try:
-            body = json.loads(Path(path).read_text())
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError("map file", str(path), f"a readable JSON file ({error})") from error
+        body = read_json("map file", path)
         if not isinstance(body, dict):
             raise InputError("map file", str(path), "a JSON object with choke, lift, cv and values")
-        for key in ("choke", "lift", "cv", "values"):
-            if key not in body:
-                raise InputError(f"map.{key}", "nothing", "a value (the key is missing)")
+        check_keys("map", body, ("choke", "lift", "cv", "values"))
         return cls(
             body["choke"],
             body["lift"],

@@ -7,7 +7,6 @@ shape: the last one is filled up with copies of its last scenario.
 from __future__ import annotations
 
 import dataclasses
-import datetime
 import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
@@ -32,8 +31,8 @@ from studies.definition.models import Point, identify_models
 from studies.definition.scenarios import Scenario, Study
 from studies.kpi.objectives import THESIS_DEADZONE
 from studies.kpi.sweep import KPIS, RECORD, batch_kpis
-from studies.store.fingerprint import versions
-from studies.store.layout import FLAG, StoreLayout, Variable
+from studies.store.fingerprint import made_now
+from studies.store.layout import FLAG, StoreLayout, Variable, process_axes
 from studies.store.trajectories import swept
 
 # A CV counts as settled within the deadzone of the thesis, whatever its own: otherwise a wide deadzone settles at once.
@@ -70,12 +69,7 @@ def prepare_study(study: Study, progress: Callable[[int, int], None] | None = No
 
 
 def run_chunk(prepared: PreparedStudy, index: int) -> ChunkResult:
-    """Run the closed loops of a chunk.
-
-    Args:
-        prepared: from `prepare_study`.
-        index: of the chunk.
-    """
+    """Run the closed loops of a chunk."""
     study = prepared.study
     chunk = study.chunks[index]
     group, lanes = study.groups[chunk.group], study.lanes(chunk.group)
@@ -107,16 +101,11 @@ def run_scenarios(
 
     Args:
         scenarios: 1 to `lanes` of them.
-        models: by working point.
         lanes: of the compiled program; it is filled up with copies of the last scenario.
         points: length of the stored time axis; shorter runs end in NaN (-1 for codes).
         every: samples from one stored point to the next.
         trajectories: fields of `Trajectory` to keep.
-        shared_model: whether all scenarios of the group have one model.
         plant_fields: parameters of the well that may differ from lane to lane.
-
-    Returns:
-        ``(fields, facts)`` as in `ChunkResult`.
     """
     clock = Clock()
     filled = [*scenarios, *([scenarios[-1]] * (lanes - len(scenarios)))]
@@ -125,26 +114,23 @@ def run_scenarios(
     model = [models[first.model_point]] if shared_model else [models[s.model_point] for s in filled]
     controllers = Controllers(first.structure, tunings, model, count=lanes)
     references = [s.reference for s in filled]
-    disturbed = any(s.disturbance is not None for s in filled)
-    noisy = any(s.noise is not None for s in filled)
-    failing = any(s.faults is not None for s in filled)
     seeds: Any = np.array([s.seed for s in filled])
-    still, quiet, sound = (
-        np.zeros(first.samples),
-        np.zeros(len(CV_NAMES)),
-        np.zeros((first.samples, len(CV_NAMES))),
-    )
+    cvs = len(CV_NAMES)
+
+    def stacked(name: str, *shape: int) -> np.ndarray | None:
+        given = [getattr(s, name) for s in filled]
+        none = all(value is None for value in given)
+        return None if none else np.stack([np.zeros(shape) if value is None else value for value in given])
+
     batches = simulate_batches(
         controllers,
         _plants(filled, plant_fields),
         references,
         samples=first.samples,
-        disturbance=np.stack([still if s.disturbance is None else s.disturbance for s in filled])
-        if disturbed
-        else None,
-        noise=np.stack([quiet if s.noise is None else s.noise for s in filled]) if noisy else None,
+        disturbance=stacked("disturbance", first.samples),
+        noise=stacked("noise", cvs),
         seed=seeds,
-        faults=np.stack([sound if s.faults is None else s.faults for s in filled]) if failing else None,
+        faults=stacked("faults", first.samples, cvs),
         position_feedback=np.array([s.position_feedback for s in filled]),
         record=tuple(dict.fromkeys((*RECORD, *(f for f in trajectories if f != "setpoint")))),
         lanes_at_once=lanes,
@@ -200,7 +186,6 @@ def study_layout(study: Study, command: str | None = None) -> StoreLayout:
     """What the store has to know of a study.
 
     Args:
-        study: the study.
         command: words after ``jaxmpc study run`` that give it: a shipped name or a file, and ``--quick``.
     """
     noise = "the column seed" if any(c.key == "seed" for c in study.columns) else study.scenario(0).seed
@@ -213,23 +198,18 @@ def study_layout(study: Study, command: str | None = None) -> StoreLayout:
         scenario_hashes=study.scenario_hashes,
         columns=study.columns,
         variables=stored_variables(study.definition.store.trajectories),
-        coords={
-            "time": (stored_times(study), "s", "time"),
-            "cv": (list(CV_NAMES), "", "controlled variable"),
-            "mv": (list(MV_NAMES), "", "manipulated variable"),
-            "cv_unit": (list(CV_UNITS), "", "unit of the CV"),
-            "mv_unit": (list(MV_UNITS), "", "unit of the MV"),
-        },
+        coords=process_axes(
+            stored_times(study), {"cv": CV_NAMES, "mv": MV_NAMES}, {"cv": CV_UNITS, "mv": MV_UNITS}
+        ),
         provenance={
             "definition": strict_json(study.definition.body),
             **({} if command is None else {"definition_file": command}),
             "folder": str(study.definition.folder),
             "quick": study.definition.is_cut,
             "seeds": {"sampling": study.definition.sampling.seed, "noise": noise},
-            "versions": versions(),
             "settled": dict(zip(CV_NAMES, SETTLED, strict=True)),
             "work": dataclasses.asdict(study.work),
-            "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            **made_now(),
         },
     )
 

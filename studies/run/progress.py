@@ -16,6 +16,12 @@ from studies.definition.estimate import Pace, Work, readable
 LAYOUT = "{l_bar}{bar}| {n_fmt}/{total_fmt} scenarios [{elapsed}{postfix}]"
 
 
+def looks(show: bool) -> dict[str, Any]:
+    """What all bars have in common."""
+    often = 0.5 if sys.stderr.isatty() else 10.0  # s; a log file needs no more
+    return {"disable": not show, "dynamic_ncols": True, "mininterval": often}
+
+
 class Progress:
     """A bar that is told of every chunk."""
 
@@ -28,9 +34,6 @@ class Progress:
         """A chunk was computed.
 
         Args:
-            chunk: its number.
-            facts: of the chunk.
-            scenarios: how many it has.
             more: to be shown beside rate and time left.
         """
         self._pace.add(chunk, facts)
@@ -47,25 +50,7 @@ class Progress:
 def progress_bar(
     name: str, total: int, stored: int, work: Work, done: Mapping[int, Mapping[str, Any]], show: bool
 ) -> Iterator[Progress]:
-    """Show a bar while chunks are computed.
-
-    Args:
-        name: of the study.
-        total: scenarios.
-        stored: scenarios that are stored already.
-        work: of the study.
-        done: facts of the chunks that are stored already.
-        show: whether to show it.
-    """
-    often = 0.5 if sys.stderr.isatty() else 10.0  # s; a log file needs no more
-    with tqdm(
-        desc=name,
-        total=total,
-        initial=stored,
-        bar_format=LAYOUT,
-        disable=not show,
-        dynamic_ncols=True,
-        mininterval=often,
-    ) as bar:
+    """Show a bar while chunks are computed."""
+    with tqdm(desc=name, total=total, initial=stored, bar_format=LAYOUT, **looks(show)) as bar:
         bar.set_postfix_str("compiles what is new to this machine; time left is known after the first chunk")
         yield Progress(bar, work, done)

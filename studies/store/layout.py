@@ -7,7 +7,7 @@ comparison is a list of scenarios with names, its controllers, in chunks of one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -58,6 +58,19 @@ class Variable:
     dims: tuple[str, ...] = ()
     dtype: str = "f8"
     empty: float | int = float("nan")
+
+
+def process_axes(
+    time: np.ndarray, names: Mapping[str, Sequence[str]], units: Mapping[str, Sequence[str]]
+) -> dict[str, tuple[Any, str, str]]:
+    """The axes of trajectories as `StoreLayout.coords`: times [s], names and units of the CVs and MVs."""
+    return {
+        "time": (time, "s", "time"),
+        "cv": (list(names["cv"]), "", "controlled variable"),
+        "mv": (list(names["mv"]), "", "manipulated variable"),
+        "cv_unit": (list(units["cv"]), "", "unit of the CV"),
+        "mv_unit": (list(units["mv"]), "", "unit of the MV"),
+    }
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxmpc.errors import InputError
-from jaxmpc.files import write_atomically
+from jaxmpc.files import read_json, write_atomically
 
 GRAVITY = 9.81  # m/s2
 GAS_CONSTANT = 8.314462618  # J/(mol K)
@@ -282,10 +282,6 @@ def model(ops, x: Sequence, u: Sequence, p) -> tuple[list, list]:
 def check_parameters(parameters: WellParameters, path: str = "well") -> WellParameters:
     """Refuse parameters that are not finite or have no physical meaning.
 
-    Args:
-        parameters: numbers or arrays (a batch of wells).
-        path: prefix of the field names in errors.
-
     Raises:
         InputError: naming the first field that is wrong and its unit.
     """
@@ -329,10 +325,7 @@ def parameters_to_dict(parameters: WellParameters) -> dict[str, float]:
 
 def load_parameters(path: str | Path) -> WellParameters:
     """Read parameters written by `save_parameters`. Raises `InputError` naming the field that is wrong."""
-    try:
-        body = json.loads(Path(path).read_text())
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError("parameter file", str(path), f"a readable JSON file ({error})") from error
+    body = read_json("parameter file", path)
     return parameters_from_dict(body.get("parameters", body) if isinstance(body, dict) else body)
 
 
