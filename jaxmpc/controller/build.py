@@ -57,27 +57,17 @@ class _Own(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scenarios:
-    """What controllers are made of, checked, one entry per scenario, and what their programs are compiled for.
+    """What controllers are made of, checked, one entry per scenario, and what their programs are compiled for."""
 
-    Attributes:
-        structures: with CVs and MVs of the same names.
-        tunings: weights and limits.
-        models: step-response models.
-        own: what has lanes; it follows from what was given, not from its values: programs of the same form are the same.
-        size: that holds all structures.
-        integers: whole moves that the tables of the search have room for.
-        has_limits: whether any CV limit costs anything.
-        switching: whether any CV may be switched off.
-    """
-
-    structures: list[Structure]
-    tunings: list[Tuning]
-    models: list[StepResponseModel]
+    structures: list[Structure]  # with CVs and MVs of the same names
+    tunings: list[Tuning]  # weights and limits
+    models: list[StepResponseModel]  # step-response models
+    # what has lanes; it follows from what was given, not from its values: programs of the same form are the same
     own: _Own
-    size: Size
-    integers: int
-    has_limits: bool
-    switching: bool
+    size: Size  # that holds all structures
+    integers: int  # whole moves that the tables of the search have room for
+    has_limits: bool  # whether any CV limit costs anything
+    switching: bool  # whether any CV may be switched off
 
     @classmethod
     def checked(

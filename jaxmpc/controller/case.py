@@ -37,31 +37,20 @@ LONGEST_HORIZON = 100_000  # samples; beyond it the file is wrong, and memory ru
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Case:
-    """One controller step, checked.
+    """One controller step, checked."""
 
-    Attributes:
-        model: step responses.
-        structure: horizons, blocks and integer steps; its names and dt are the model's.
-        tuning: weights and limits.
-        mv_now: ``"mv"``, MVs before the move that is to be decided [MV unit].
-        last_move: ``"mv"``, the move that was applied at the previous sample [MV unit].
-        free_response: ``"horizon cv"``, what the CVs do without further moves, bias included [CV unit].
-        setpoint: ``"horizon cv"`` [CV unit].
-        previous_moves: ``"block mv"``, where the search may start [MV unit per sample], or ``None``.
-        time_limit: of the solve [s], or ``None``.
-        gap: relative gap at which the plan counts as optimal.
-    """
-
-    model: StepResponseModel
-    structure: Structure
-    tuning: Tuning
-    mv_now: np.ndarray
-    last_move: np.ndarray
+    model: StepResponseModel  # step responses
+    structure: Structure  # horizons, blocks and integer steps; its names and dt are the model's
+    tuning: Tuning  # weights and limits
+    mv_now: np.ndarray  # ``"mv"``, MVs before the move that is to be decided [MV unit]
+    last_move: np.ndarray  # ``"mv"``, the move that was applied at the previous sample [MV unit]
+    # ``"horizon cv"``, what the CVs do without further moves, bias included [CV unit]
     free_response: np.ndarray
-    setpoint: np.ndarray
+    setpoint: np.ndarray  # ``"horizon cv"`` [CV unit]
+    # ``"block mv"``, where the search may start [MV unit per sample], or ``None``
     previous_moves: np.ndarray | None = None
-    time_limit: float | None = None
-    gap: float = DEFAULT_GAP
+    time_limit: float | None = None  # of the solve [s], or ``None``
+    gap: float = DEFAULT_GAP  # relative gap at which the plan counts as optimal
 
 
 class _ModelFields(msgspec.Struct, forbid_unknown_fields=True):

@@ -74,23 +74,15 @@ class Relaxers:
 
 @dataclasses.dataclass(eq=False)
 class Batch:
-    """Controllers that are built: the lanes of `Controllers`, or some of them.
+    """Controllers that are built: the lanes of `Controllers`, or some of them."""
 
-    Attributes:
-        scenarios: what they are made of.
-        cores: what compiled programs know of them.
-        relaxers: what searches on the host need.
-        gap, time_limit, finish: see `Controllers`.
-        decided: whether a step has been.
-    """
-
-    scenarios: Scenarios
-    cores: Lanes[Core]
-    relaxers: Relaxers
+    scenarios: Scenarios  # what they are made of
+    cores: Lanes[Core]  # what compiled programs know of them
+    relaxers: Relaxers  # what searches on the host need
     gap: float
     time_limit: float | None
     finish: str
-    decided: bool = False
+    decided: bool = False  # whether a step has been
 
     def __post_init__(self):
         self.count, self.size = self.scenarios.count, self.scenarios.size

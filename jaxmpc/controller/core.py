@@ -33,35 +33,20 @@ from jaxmpc.relaxed.solve import cold_start, shifted_start
 
 
 class ControllerState(eqx.Module):
-    """What a controller remembers from sample to sample.
+    """What a controller remembers from sample to sample."""
 
-    Attributes:
-        base: CVs the run started from; predictions are deviations from them [CV unit].
-        future: effect of the moves made so far on the samples from now on [CV unit].
-        bias: filtered output bias v(k|k).
-        bias_raw: output bias before the filter (2.31b).
-        mv: present demand [MV unit].
-        position: where the actuators stand in the predictions [MV unit].
-        last_move: previous move, of the actuators where these are told [MV unit].
-        past_moves: the last moves, oldest first [MV unit].
-        plan: the previous plan shifted by one sample, block moves [MV unit].
-        warm: moves and prices of the previous relaxation, shifted; where the next solve starts.
-        sensors: what the measurements were worth.
-        manual: MVs that somebody else moved at the last sample.
-    """
-
-    base: Float[Array, " cv"]
-    future: Float[Array, "cv future"]
-    bias: Float[Array, " cv"]
-    bias_raw: Float[Array, " cv"]
-    mv: Float[Array, " mv"]
-    position: Float[Array, " mv"]
-    last_move: Float[Array, " mv"]
-    past_moves: Float[Array, "past mv"]
-    plan: Float[Array, "block mv"]
-    warm: WarmStart
-    sensors: Sensors
-    manual: Bool[Array, " mv"]
+    base: Float[Array, " cv"]  # CVs the run started from; predictions are deviations from them [CV unit]
+    future: Float[Array, "cv future"]  # effect of the moves made so far on the samples from now on [CV unit]
+    bias: Float[Array, " cv"]  # filtered output bias v(k|k)
+    bias_raw: Float[Array, " cv"]  # output bias before the filter (2.31b)
+    mv: Float[Array, " mv"]  # present demand [MV unit]
+    position: Float[Array, " mv"]  # where the actuators stand in the predictions [MV unit]
+    last_move: Float[Array, " mv"]  # previous move, of the actuators where these are told [MV unit]
+    past_moves: Float[Array, "past mv"]  # the last moves, oldest first [MV unit]
+    plan: Float[Array, "block mv"]  # the previous plan shifted by one sample, block moves [MV unit]
+    warm: WarmStart  # moves and prices of the previous relaxation, shifted; where the next solve starts
+    sensors: Sensors  # what the measurements were worth
+    manual: Bool[Array, " mv"]  # MVs that somebody else moved at the last sample
 
 
 class StepInfo(eqx.Module):
@@ -99,25 +84,15 @@ class StepInfo(eqx.Module):
 
 
 class Moment(NamedTuple):
-    """A sample that is observed and decided as far as a compiled program decides it.
+    """A sample that is observed and decided as far as a compiled program decides it."""
 
-    Attributes:
-        state: after the measurement.
-        free_response: Lambda (5.13) at j = 1, 2, ... [CV unit].
-        instance: its problem.
-        decision: what the search found.
-        scale: MV units per unit of x.
-        unit: of the objective, see `gap.closes`.
-        recovering: whether an MV is outside its limits.
-    """
-
-    state: ControllerState
-    free_response: Float[Array, "future cv"]
-    instance: QpInstance
-    decision: Decision
-    scale: Float[Array, " n"]
-    unit: Float[Array, ""]
-    recovering: Bool[Array, ""]
+    state: ControllerState  # after the measurement
+    free_response: Float[Array, "future cv"]  # Lambda (5.13) at j = 1, 2, ... [CV unit]
+    instance: QpInstance  # its problem
+    decision: Decision  # what the search found
+    scale: Float[Array, " n"]  # MV units per unit of x
+    unit: Float[Array, ""]  # of the objective, see `gap.closes`
+    recovering: Bool[Array, ""]  # whether an MV is outside its limits
 
     @property
     def good(self) -> Bool[Array, ""]:
@@ -142,25 +117,16 @@ class Moment(NamedTuple):
 
 
 class Core(eqx.Module):
-    """Everything of a controller that stays the same from sample to sample, as arrays of a size.
+    """Everything of a controller that stays the same from sample to sample, as arrays of a size."""
 
-    Attributes:
-        layout: the structure.
-        tuning: weights and limits.
-        coefficients: of the model, as long as the shift register [CV unit per MV unit].
-        qp: constant part of the problems.
-        tables: what the search for whole moves reads.
-        size: of the arrays.
-        switching: whether a CV may be switched off by bad measurements.
-    """
-
-    layout: Layout
-    tuning: Tuning
+    layout: Layout  # the structure
+    tuning: Tuning  # weights and limits
+    # of the model, as long as the shift register [CV unit per MV unit]
     coefficients: Float[Array, "cv mv future"]
-    qp: CondensedQp
-    tables: Tables
-    size: Size = eqx.field(static=True)
-    switching: bool = eqx.field(static=True)
+    qp: CondensedQp  # constant part of the problems
+    tables: Tables  # what the search for whole moves reads
+    size: Size = eqx.field(static=True)  # of the arrays
+    switching: bool = eqx.field(static=True)  # whether a CV may be switched off by bad measurements
 
     def init(self, cv: Float[Array, " cv"], mv: Float[Array, " mv"]) -> ControllerState:
         """State of a controller that starts in a steady state."""

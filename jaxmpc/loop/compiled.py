@@ -34,43 +34,25 @@ APART = 5  # Newton steps that take as long as the rest of a sample
 
 
 class Now(NamedTuple):
-    """A sample whose measurement is known; all arrays with a scenario axis.
+    """A sample whose measurement is known; all arrays with a scenario axis."""
 
-    Attributes:
-        moment: of the controllers, after the measurement.
-        plant: state of the plant.
-        cv: measured by sensors without fault.
-        mv: where the actuators stand.
-        x: the plan, scaled.
-        good: whether there is one.
-        decided: whether `x` and `good` are known.
-    """
-
-    moment: Moment
-    plant: Any
-    cv: Float[Array, "scenario cv"]
-    mv: Float[Array, "scenario mv"]
-    x: Float[Array, "scenario n"]
-    good: Bool[Array, " scenario"]
-    decided: Bool[Array, " scenario"]
+    moment: Moment  # of the controllers, after the measurement
+    plant: Any  # state of the plant
+    cv: Float[Array, "scenario cv"]  # measured by sensors without fault
+    mv: Float[Array, "scenario mv"]  # where the actuators stand
+    x: Float[Array, "scenario n"]  # the plan, scaled
+    good: Bool[Array, " scenario"]  # whether there is one
+    decided: Bool[Array, " scenario"]  # whether `x` and `good` are known
 
 
 class Inputs(NamedTuple):
-    """What comes from outside, of all scenarios.
+    """What comes from outside, of all scenarios."""
 
-    Attributes:
-        setpoints: ``"scenario sample cv"`` [CV unit].
-        disturbance: ``"scenario sample"``.
-        errors: noise of the sensors, ``"scenario sample cv"`` [CV unit].
-        faults: of the sensors, as of `measurement.fault_errors`.
-        told: ``"scenario"``, whether the controller is told where the actuators stand.
-    """
-
-    setpoints: np.ndarray
-    disturbance: np.ndarray
-    errors: np.ndarray
-    faults: np.ndarray
-    told: np.ndarray
+    setpoints: np.ndarray  # ``"scenario sample cv"`` [CV unit]
+    disturbance: np.ndarray  # ``"scenario sample"``
+    errors: np.ndarray  # noise of the sensors, ``"scenario sample cv"`` [CV unit]
+    faults: np.ndarray  # of the sensors, as of `measurement.fault_errors`
+    told: np.ndarray  # ``"scenario"``, whether the controller is told where the actuators stand
 
 
 def simulate_compiled(

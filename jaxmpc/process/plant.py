@@ -50,59 +50,35 @@ class JaxOps:
 
 
 class WellState(eqx.Module):
-    """State of the plant.
+    """State of the plant."""
 
-    Attributes:
-        x: the states of the well in the order and units of `jaxmpc.process.well.equations.STATES`.
-        position: choke position after the actuator [%].
-        lift: lift demand that was last applied [m3/h].
-    """
-
+    # the states of the well in the order and units of `jaxmpc.process.well.equations.STATES`
     x: Float[Array, "8"]
-    position: Float[Array, ""]
-    lift: Float[Array, ""]
+    position: Float[Array, ""]  # choke position after the actuator [%]
+    lift: Float[Array, ""]  # lift demand that was last applied [m3/h]
 
 
 class WellOutputs(NamedTuple):
-    """What a plant measures; JAX arrays from `WellPlant`, NumPy values from the FMU plant.
+    """What a plant measures; JAX arrays from `WellPlant`, NumPy values from the FMU plant."""
 
-    Attributes:
-        cv: gas rate at standard conditions and oil rate [m3/h].
-        mv: choke position after the actuator [%] and lift demand [m3/h], as applied.
-        wellhead_pressure: upstream of the choke [bar].
-        bottom_hole_pressure: at the perforations [bar].
-        annulus_pressure: at the top of the annulus [bar].
-        injection_pressure: in the tubing at the gas-lift valve [bar].
-        delivered_lift: what the supply delivers [m3/h].
-        choke_opening: of the choke, which follows its position with a lag [%].
-    """
-
-    cv: Any
-    mv: Any
-    wellhead_pressure: Any
-    bottom_hole_pressure: Any
-    annulus_pressure: Any
-    injection_pressure: Any
-    delivered_lift: Any
-    choke_opening: Any
+    cv: Any  # gas rate at standard conditions and oil rate [m3/h]
+    mv: Any  # choke position after the actuator [%] and lift demand [m3/h], as applied
+    wellhead_pressure: Any  # upstream of the choke [bar]
+    bottom_hole_pressure: Any  # at the perforations [bar]
+    annulus_pressure: Any  # at the top of the annulus [bar]
+    injection_pressure: Any  # in the tubing at the gas-lift valve [bar]
+    delivered_lift: Any  # what the supply delivers [m3/h]
+    choke_opening: Any  # of the choke, which follows its position with a lag [%]
 
 
 class SteadyState(NamedTuple):
-    """Result of `steady_state`.
+    """Result of `steady_state`."""
 
-    Attributes:
-        x: ``"8"``, the state (of the last iteration, where it did not converge).
-        outputs: `WellOutputs` at that state.
-        converged: whether the scaled drift fell below `STEADY_TOLERANCE`.
-        drift: largest scaled rate of change left [1/s].
-        hours: simulated on the way [h].
-    """
-
-    x: Float[Array, "8"]
-    outputs: WellOutputs
-    converged: Bool[Array, ""]
-    drift: Float[Array, ""]
-    hours: Int[Array, ""]
+    x: Float[Array, "8"]  # ``"8"``, the state (of the last iteration, where it did not converge)
+    outputs: WellOutputs  # `WellOutputs` at that state
+    converged: Bool[Array, ""]  # whether the scaled drift fell below `STEADY_TOLERANCE`
+    drift: Float[Array, ""]  # largest scaled rate of change left [1/s]
+    hours: Int[Array, ""]  # simulated on the way [h]
 
 
 def rates(x: Float[Array, "8"], u: Float[Array, "3"], parameters: WellParameters) -> Float[Array, "8"]:

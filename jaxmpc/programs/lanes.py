@@ -20,15 +20,10 @@ T = TypeVar("T")
 
 
 class Lanes(eqx.Module, Generic[T]):
-    """A batch of `T`, split into arrays with a leading lane axis and everything else.
+    """A batch of `T`, split into arrays with a leading lane axis and everything else."""
 
-    Attributes:
-        each: a `T` with the arrays that have a lane axis, None in all other places.
-        shared: a `T` with None in these places and what all lanes share in the others.
-    """
-
-    each: Any
-    shared: Any
+    each: Any  # a `T` with the arrays that have a lane axis, None in all other places
+    shared: Any  # a `T` with None in these places and what all lanes share in the others
 
     @property
     def count(self) -> int | None:

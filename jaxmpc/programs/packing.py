@@ -23,17 +23,11 @@ FLOAT = np.dtype(float)
 
 @dataclasses.dataclass(frozen=True)
 class Packing:
-    """Where the arrays of a tree lie in one array ``"lane entry"``; hashable, so that it can be a static argument.
+    """Where the arrays of a tree lie in one array ``"lane entry"``; hashable, so that it can be a static argument."""
 
-    Attributes:
-        form: structure of the tree.
-        shapes: of its arrays, without the lane axis.
-        kinds: their types.
-    """
-
-    form: Any
-    shapes: tuple[tuple[int, ...], ...]
-    kinds: tuple[np.dtype, ...]
+    form: Any  # structure of the tree
+    shapes: tuple[tuple[int, ...], ...]  # of its arrays, without the lane axis
+    kinds: tuple[np.dtype, ...]  # their types
 
     @classmethod
     def of(cls, tree: Any) -> Packing:

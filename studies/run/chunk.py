@@ -49,17 +49,11 @@ class PreparedStudy:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ChunkResult:
-    """What a chunk leaves behind.
+    """What a chunk leaves behind."""
 
-    Attributes:
-        index: of the chunk.
-        fields: every stored variable, ``"lane ..."``, real lanes only.
-        facts: JSON-like: ``wall_time`` [s], compilation left out, and where it was computed.
-    """
-
-    index: int
-    fields: dict[str, np.ndarray]
-    facts: dict[str, Any]
+    index: int  # of the chunk
+    fields: dict[str, np.ndarray]  # every stored variable, ``"lane ..."``, real lanes only
+    facts: dict[str, Any]  # JSON-like: ``wall_time`` [s], compilation left out, and where it was computed
 
 
 def prepare_study(study: Study, progress: Callable[[int, int], None] | None = None) -> PreparedStudy:

@@ -59,18 +59,12 @@ class SearchStudy:
     """A search, checked when it exists; made by `studies.load`.
 
     Scenario k belongs to batch ``k // chunk_size``.
-
-    Attributes:
-        definition: as written, quick cuts applied.
-        parameters: one per axis, in the order of the definition.
-        objectives: what is weighed.
-        probe: study of extremes of the parameters, all of which can start.
     """
 
-    definition: StudyDefinition
-    parameters: tuple[Parameter, ...]
-    objectives: tuple[Objective, ...]
-    probe: Study
+    definition: StudyDefinition  # as written, quick cuts applied
+    parameters: tuple[Parameter, ...]  # one per axis, in the order of the definition
+    objectives: tuple[Objective, ...]  # what is weighed
+    probe: Study  # study of extremes of the parameters, all of which can start
 
     @property
     def name(self) -> str:

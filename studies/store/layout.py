@@ -24,40 +24,25 @@ FLAG = "complete"  # the one variable that the store also knows
 
 @dataclass(frozen=True)
 class Column:
-    """One scenario coordinate: what differs between the scenarios.
+    """One scenario coordinate: what differs between the scenarios."""
 
-    Attributes:
-        key: full key of the definition, for example ``tuning.deadzone.gas_rate``.
-        label: in words, for tables and axes.
-        unit: ``"1"`` for a number without unit, ``""`` for text.
-        values: one per scenario, numbers or text.
-    """
-
-    key: str
-    label: str
-    unit: str
-    values: np.ndarray
+    key: str  # full key of the definition, for example ``tuning.deadzone.gas_rate``
+    label: str  # in words, for tables and axes
+    unit: str  # ``"1"`` for a number without unit, ``""`` for text
+    values: np.ndarray  # one per scenario, numbers or text
 
 
 @dataclass(frozen=True)
 class Variable:
-    """One result per scenario.
+    """One result per scenario."""
 
-    Attributes:
-        name: of the variable in the store.
-        long_name: in words.
-        unit: of the values.
-        dims: axes after ``scenario``, for example ``()``, ``("cv",)`` or ``("time", "cv")``.
-        dtype: of the stored values, for example ``"f8"``.
-        empty: value before it is computed.
-    """
-
-    name: str
-    long_name: str
-    unit: str
+    name: str  # of the variable in the store
+    long_name: str  # in words
+    unit: str  # of the values
+    # axes after ``scenario``, for example ``()``, ``("cv",)`` or ``("time", "cv")``
     dims: tuple[str, ...] = ()
-    dtype: str = "f8"
-    empty: float | int = float("nan")
+    dtype: str = "f8"  # of the stored values, for example ``"f8"``
+    empty: float | int = float("nan")  # value before it is computed
 
 
 def process_axes(
