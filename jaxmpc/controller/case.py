@@ -164,11 +164,11 @@ def make_case(body: Any) -> Case:
         model=model,
         structure=structure,
         tuning=make_tuning(structure, **{key: getattr(fields.tuning, key) for key in _IN_STEP}),
-        **{key: _array(key, getattr(fields, key), structure) for key in _ARRAYS},
+        **{key: step_array(key, getattr(fields, key), structure) for key in _ARRAYS},
         time_limit=check_time_limit("limits.time_s", limits.time_s),
         gap=check_gap("limits.gap", limits.gap),
     )
-    _check_position(case)
+    check_position(structure, case.tuning, case.mv_now)
     return case
 
 
@@ -264,10 +264,11 @@ def _structure(fields: _StructureFields, model: StepResponseModel) -> Structure:
     )
 
 
-def _array(path: str, given: list[Any] | None, structure: Structure) -> Any:
+def step_array(path: str, given: Any, structure: Structure) -> Any:
     """A finite vector with one entry per name, or a matrix of such rows, as many as it must have; None as it is."""
     if given is None:
         return None
+    given = np.asarray(given) if hasattr(given, "shape") else given
     _, columns, count, why = _ARRAYS[path]
     names = getattr(structure, columns)
     numbers = f"{len(names)} numbers{_unit(path)}"
@@ -275,7 +276,7 @@ def _array(path: str, given: list[Any] | None, structure: Structure) -> Any:
         expected = f"{why} = {getattr(structure, count)} rows of {numbers}"
         raise InputError(path, f"{len(given)} rows", expected)
     for i, row in enumerate(given if count else [given]):
-        if len(row) != len(names):
+        if np.size(row) != len(names):
             raise InputError(f"{path}[{i}]" if count else path, row, f"{numbers} for {', '.join(names)}")
     array = np.array(given, dtype=np.float64)
     bad = np.argwhere(~sound(array))
@@ -287,12 +288,12 @@ def _array(path: str, given: list[Any] | None, structure: Structure) -> Any:
     return array
 
 
-def _check_position(case: Case) -> None:
+def check_position(structure: Structure, tuning: Tuning, mv_now: np.ndarray) -> None:
     """Refuse MVs outside their limits: the closed-loop controller recovers, a single step cannot."""
-    low, high = np.asarray(case.tuning.mv_low), np.asarray(case.tuning.mv_high)
-    for i, name in enumerate(case.structure.mv_names):
-        now = float(case.mv_now[i])
-        drift = DRIFT * (case.structure.integer_step[i] or max(1.0, abs(now)))  # what MIP solvers leave over
+    low, high = np.asarray(tuning.mv_low), np.asarray(tuning.mv_high)
+    for i, name in enumerate(structure.mv_names):
+        now = float(mv_now[i])
+        drift = DRIFT * (structure.integer_step[i] or max(1.0, abs(now)))  # what MIP solvers leave over
         if not low[i] - drift <= now <= high[i] + drift:
             expected = f"mv_low[{i}] = {low[i]:g} to mv_high[{i}] = {high[i]:g} [MV unit] for {name}"
             raise InputError(f"mv_now[{i}]", now, expected)

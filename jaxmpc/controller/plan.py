@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,11 +17,10 @@ from numpy.typing import ArrayLike
 
 from jaxmpc import html
 from jaxmpc import status as codes
-from jaxmpc.check import LARGEST, check_vector, sound
+from jaxmpc.controller.case import check_position, step_array
 from jaxmpc.controller.controller import Controllers, check_finish, in_one_call, one_lane
 from jaxmpc.controller.core import Core
 from jaxmpc.controller.sample import require_double_precision
-from jaxmpc.errors import InputError
 from jaxmpc.integer.finish import finish_steps
 from jaxmpc.integer.host_search import SearchResult
 from jaxmpc.integer.relaxer import Relaxations
@@ -29,7 +29,7 @@ from jaxmpc.integer.solve import continuous_feasible
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.blocking import moves_per_block, sample_moves
 from jaxmpc.problem.condense import dynamic_matrix
-from jaxmpc.problem.instance import DRIFT, QpInstance, make_instance
+from jaxmpc.problem.instance import QpInstance, make_instance
 from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
@@ -319,35 +319,10 @@ def solve_plan(
     Raises:
         InputError: naming the field, for wrong shapes, NaN or an MV outside its limits.
     """
-    now = check_vector("mv_now", mv_now, structure.mv_names, "MV unit")
-    check_vector("last_move", last_move, structure.mv_names, "MV unit")
-    for path, value in (("free_response", free_response), ("setpoint", setpoint)):
-        array = np.asarray(value, dtype=np.float64)
-        expected = (structure.prediction_horizon, structure.cv_count)
-        if array.shape != expected or not sound(array).all():
-            raise InputError(
-                path,
-                f"shape {list(array.shape)}",
-                f"finite numbers of size {LARGEST:g} at most and of shape {list(expected)} [CV unit]",
-            )
-    low, high = np.asarray(tuning.mv_low), np.asarray(tuning.mv_high)
-    for i, name in enumerate(structure.mv_names):
-        drift = DRIFT * (structure.integer_step[i] or max(1.0, abs(now[i])))
-        if not low[i] - drift <= now[i] <= high[i] + drift:
-            raise InputError(f"mv_now[{i}]", now[i], f"between {low[i]} and {high[i]} [MV unit] for {name}")
-    if previous_moves is not None and np.shape(previous_moves) != (structure.block_count, structure.mv_count):
-        raise InputError(
-            "previous_moves",
-            f"shape {list(np.shape(previous_moves))}",
-            f"shape {[structure.block_count, structure.mv_count]}, block by MV",
-        )
-    return Planner(structure, tuning, model).solve(
-        mv_now=now,
-        last_move=last_move,
-        free_response=free_response,
-        setpoint=setpoint,
-        previous_moves=previous_moves,
-        time_limit=time_limit,
-        gap=gap,
-        finish=finish,
-    )
+    given = dict(mv_now=mv_now, last_move=last_move, free_response=free_response, setpoint=setpoint)
+    known: dict[str, Any] = {
+        path: step_array(path, value, structure)
+        for path, value in (given | {"previous_moves": previous_moves}).items()
+    }
+    check_position(structure, tuning, known["mv_now"])
+    return Planner(structure, tuning, model).solve(**known, time_limit=time_limit, gap=gap, finish=finish)

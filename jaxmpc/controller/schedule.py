@@ -244,6 +244,7 @@ class _Table:
             raise InputError("kept", kept, "a whole number of controllers, 1 or more")
         self.reference, self.schedule, self.spacing, self.kept = controllers, schedule, spacing, kept
         self.size, self.init, self.structure = controllers.size, controllers.init, controllers.structure
+        self.scenarios, self.count = controllers.scenarios, 1
         self.grid = np.array([step or spacing for step in self.structure.integer_step])
         self.built = 0  # controllers made so far
         self._table: collections.OrderedDict[tuple[float, ...], Controllers] = collections.OrderedDict()
