@@ -35,12 +35,11 @@ _condense = jax.jit(condense, static_argnames=("size", "envelope", "has_limits")
 def _condense_some(layouts: Lanes[Layout], size, tunings, matrices: Lanes[Matrices], envelope, has_limits):
     """Problems of `AT_ONCE` lanes, without their responses."""
 
-    def lane(own_layout, tuning, own_matrices):
-        layout = eqx.combine(own_layout, layouts.shared)
-        given = eqx.combine(own_matrices, matrices.shared)
+    def lane(layout, tuning, own):
+        given = eqx.combine(own, matrices.shared)
         return _bare(condense(layout, size, tuning, given, envelope=envelope, has_limits=has_limits))
 
-    return jax.vmap(lane)(layouts.each, tunings, matrices.each)
+    return layouts.vmap(lane, tunings, matrices.each)
 
 
 def _bare(qp: CondensedQp) -> CondensedQp:

@@ -292,8 +292,7 @@ def _said(result: SearchResult, unit: float) -> dict[str, Any]:
 @functools.partial(jax.jit, static_argnames="form")
 def _init(leaves, cv, mv, form) -> ControllerState:
     cores: Lanes[Core] = rebuilt(form, leaves)
-    one = lambda own, cv, mv: eqx.combine(own, cores.shared).init(cv, mv)  # noqa: E731
-    return jax.vmap(one)(cores.each, cv, mv)
+    return cores.vmap(lambda core, *start: core.init(*start), cv, mv)
 
 
 @jax.jit
@@ -304,25 +303,21 @@ def considered(cores: Lanes[Core], state: ControllerState, sample: Sample, setti
         settings: ``"scenario 2"``, relative gap, and whether whole moves may be searched for (1 or 0).
     """
 
-    def one(own, state, sample, settings):
-        core: Core = eqx.combine(own, cores.shared)
+    def one(core: Core, state, sample, settings):
         return core.consider(state, sample, settings[0], settings[1] > 0)
 
-    return jax.vmap(one)(cores.each, state, sample, settings)
+    return cores.vmap(one, state, sample, settings)
 
 
 def _stepped(cores: Lanes[Core], state, sample, settings) -> tuple:
     moments = considered(cores, state, sample, settings)
-    return *jax.vmap(lambda own, moment: eqx.combine(own, cores.shared).conclude(moment))(
-        cores.each, moments
-    ), moments
+    return *cores.vmap(lambda core, moment: core.conclude(moment), moments), moments
 
 
 @functools.partial(jax.jit, static_argnames="form")
 def _carry_out(leaves, moment: Moment, x, good, form):
     cores: Lanes[Core] = rebuilt(form, leaves)
-    one = lambda own, *rest: eqx.combine(own, cores.shared).carry_out(*rest)  # noqa: E731
-    return jax.vmap(one)(cores.each, moment, x, good)
+    return cores.vmap(lambda core, *plan: core.carry_out(*plan), moment, x, good)
 
 
 class Controller:

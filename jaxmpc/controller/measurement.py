@@ -2,7 +2,7 @@
 
 A measurement is bad that is not a number, lies outside its validation limits, or has not changed for too long. The bias of
 its CV is kept or fades, the other CVs go on; after so many in a row the CV is switched off, and the first good
-one brings it back. `controller.Memory` judges every sample; `fault_errors` makes sensors fail in closed loops.
+one brings it back. `Core.observe` judges every sample; `fault_errors` makes sensors fail in closed loops.
 """
 
 from __future__ import annotations

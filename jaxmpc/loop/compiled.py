@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxmpc.controller.controller import Batch, considered
-from jaxmpc.controller.core import Core, Moment
+from jaxmpc.controller.core import Moment
 from jaxmpc.controller.measurement import received
 from jaxmpc.controller.sample import Sample
 from jaxmpc.programs.clock import Clock
@@ -208,12 +208,11 @@ class _Run:
 
 @eqx.filter_jit
 def _steady(plants: Lanes):
-    def lane(own):
-        plant = eqx.combine(own, plants.shared)
+    def lane(plant):
         state = plant.init()
         return state, plant.measure(state)
 
-    return jax.vmap(lane)(plants.each)
+    return plants.vmap(lane)
 
 
 @functools.partial(jax.jit, static_argnames=("form", "of_now"))
@@ -227,16 +226,9 @@ def _stride(leaves, packed, inputs, settings, form, of_now: Packing):
     late = now.decided[0].astype(int)  # measured is sample `late`, then late + 1, ...
 
     def carry_out(now: Now, at) -> tuple[Now, dict[str, Array]]:
-        def plan(own, moment, x, good):
-            core: Core = eqx.combine(own, cores.shared)
-            return core.carry_out(moment, x, good)
-
-        state, moves = jax.vmap(plan)(cores.each, now.moment, now.x, now.good)
-
-        def advance(own, plant_state, mv, offset):
-            return eqx.combine(own, plants.shared).step(plant_state, mv, offset)
-
-        plant_state, outputs = jax.vmap(advance)(plants.each, now.plant, state.mv, disturbance[:, at])
+        state, moves = cores.vmap(lambda core, *plan: core.carry_out(*plan), now.moment, now.x, now.good)
+        advance = lambda plant, *given: plant.step(*given)  # noqa: E731
+        plant_state, outputs = plants.vmap(advance, now.plant, state.mv, disturbance[:, at])
         now = now._replace(
             moment=now.moment._replace(state=state),
             plant=plant_state,

@@ -1,5 +1,5 @@
 """What may happen to a controller during a run: others take over from it (thesis 7.2.4), or its plan is carried out to
-its end without a look at the well (thesis 7.2.3). `closed_loop.simulate` is the only caller.
+its end without a look at the well (thesis 7.2.3). `loop.simulate` is the only caller.
 """
 
 from __future__ import annotations

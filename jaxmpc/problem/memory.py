@@ -1,7 +1,7 @@
 """Problems that cannot fit into memory, refused before anything is computed: horizons and blocks, ranges of whole moves.
 
 The estimates count the arrays of one solve, generously; a problem beyond `BUDGET` has a typing error in a horizon, a step
-or a limit. `step_solver` calls both.
+or a limit.
 """
 
 from __future__ import annotations

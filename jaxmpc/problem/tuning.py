@@ -112,7 +112,6 @@ class Tuning(eqx.Module):
 
 FIELDS = MappingProxyType(declared(Tuning))
 CV_FIELDS = tuple(key for key, field in FIELDS.items() if field.of == "cv")
-MV_FIELDS = tuple(key for key, field in FIELDS.items() if field.of == "mv" and not field.flag)
 LIMIT_PAIRS = tuple((key, field.high) for key, field in FIELDS.items() if field.high)
 DEFAULTS = MappingProxyType(
     {key: field.default for key, field in FIELDS.items() if field.default is not None}

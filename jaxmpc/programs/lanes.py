@@ -38,6 +38,12 @@ class Lanes(eqx.Module, Generic[T]):
         """The `T` whose arrays have a lane axis where `each` has them."""
         return eqx.combine(self.each, self.shared)
 
+    def vmap(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """The results of ``function(lane, *arguments)``, whose arguments have a lane axis each."""
+        return jax.vmap(lambda own, *rest: function(eqx.combine(own, self.shared), *rest))(
+            self.each, *arguments
+        )
+
     def lane(self, k: int) -> T:
         """The `T` of lane k alone."""
         return eqx.combine(jax.tree.map(lambda leaf: leaf[k], self.each), self.shared)

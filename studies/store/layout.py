@@ -63,9 +63,6 @@ class StoreLayout:
     """The store of one study before anything is computed.
 
     Attributes:
-        name: short name of the study.
-        title: one line about it.
-        study_hash: of everything that the results depend on.
         chunk_size: slots per chunk.
         chunk_scenarios: scenario numbers of each chunk, 1 to `chunk_size` of them.
         scenario_hashes: content hash of each scenario, by scenario number.
