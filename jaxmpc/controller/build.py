@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Bool
@@ -204,8 +203,7 @@ class Scenarios:
 def _no_tables(qps: Lanes[CondensedQp]) -> Lanes[Tables]:
     """For problems without integer moves; traced where these are."""
     shared = qps.each.curvature is None
-    curvature = qps.shared.curvature if shared else qps.each.curvature
-    scale = jnp.maximum(jnp.max(jnp.diagonal(curvature, axis1=-2, axis2=-1), axis=-1), 1e-12)
+    scale = qps.value.unit
     one, square, levels = np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))
     whole, flag = one.astype(int), one.astype(bool)
     zero, yes = np.asarray(0), np.asarray(True)

@@ -7,6 +7,7 @@ solve that gives no plan holds the MVs, and the info says so.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -23,7 +24,7 @@ from jaxmpc.controller.sample import Sample
 from jaxmpc.integer.search import Decision, decide
 from jaxmpc.integer.tables import Tables
 from jaxmpc.model.step_response import advance_free_response, shift_free_response
-from jaxmpc.problem.condense import CondensedQp, condense, matrices_of
+from jaxmpc.problem.condense import CondensedQp, Matrices, condense, matrices_of
 from jaxmpc.problem.instance import QpInstance, make_instance
 from jaxmpc.problem.layout import Layout, Size
 from jaxmpc.problem.tuning import Tuning
@@ -246,15 +247,16 @@ class Core(eqx.Module):
             given = self.qp
             matrices = matrices_of(self.layout, self.size, self.coefficients, summed=False)
             matrices = eqx.tree_at(lambda m: m.summed, matrices, given.summed, is_leaf=lambda v: v is None)
-            levels, tuning = given.steep.shape[0], without(self.tuning, off)
-            return condense(
-                self.layout, self.size, tuning, matrices, envelope=levels, has_limits=given.has_limits
-            )
+            return self.condensed(without(self.tuning, off), matrices)
 
         qp = jax.lax.cond(jnp.any(off), reduced, lambda: self.qp)
         known = self.tables.known & ~jnp.any(off)
-        scale = jnp.maximum(jnp.max(jnp.diagonal(qp.curvature)), 1e-12)
-        return qp, eqx.tree_at(lambda t: (t.known, t.scale), self.tables, (known, scale))
+        return qp, eqx.tree_at(lambda t: (t.known, t.scale), self.tables, (known, qp.unit))
+
+    def condensed(self, tuning: Tuning, matrices: Matrices) -> CondensedQp:
+        """The constant part of another tuning or model, in the form of this one's."""
+        form: dict[str, Any] = dict(envelope=self.qp.steep.shape[0], has_limits=self.qp.has_limits)
+        return condense(self.layout, self.size, tuning, matrices, **form)
 
     def consider(self, state: ControllerState, sample: Sample, gap, search=True) -> Moment:
         """Observe, pose and decide a sample.
@@ -295,19 +297,15 @@ class Core(eqx.Module):
             moves: the plan [MV unit], padded.
         """
         move = moves[0]
-        return ControllerState(
-            base=state.base,
+        return dataclasses.replace(
+            state,
             future=advance_free_response(state.future, self.moving(state.mv, move), move),
-            bias=state.bias,
-            bias_raw=state.bias_raw,
             mv=state.mv + move,
             position=state.position + move,
             last_move=move,
             past_moves=jnp.concatenate([state.past_moves[1:], move[None]]),
             plan=self.layout.shift @ moves,
             warm=shifted_start(warm, self.size.cvs),
-            sensors=state.sensors,
-            manual=state.manual,
         )
 
     def moving(self, before: Float[Array, " mv"], move: Float[Array, " mv"]) -> Float[Array, "cv mv future"]:

@@ -34,7 +34,7 @@ from jaxmpc.controller.sample import Sample
 from jaxmpc.errors import InputError
 from jaxmpc.files import read_json, write_atomically
 from jaxmpc.model.step_response import StepResponseModel, advance_free_response, make_model
-from jaxmpc.problem.condense import condense, matrices_of
+from jaxmpc.problem.condense import matrices_of
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
 from jaxmpc.programs.clock import Clock
@@ -217,10 +217,8 @@ class ScheduledCore(Core):
         standing = self.locate(state, sample.mv, sample.manual).mv
         coefficients = _register(self.schedule, standing, self.size.future)
         matrices = matrices_of(self.layout, self.size, coefficients, summed=False)
-        levels, limits = self.qp.steep.shape[0], self.qp.has_limits
-        qp = condense(self.layout, self.size, self.tuning, matrices, envelope=levels, has_limits=limits)
-        scale = jnp.maximum(jnp.max(jnp.diagonal(qp.curvature)), 1e-12)
-        tables = eqx.tree_at(lambda t: t.scale, self.tables, scale)
+        qp = self.condensed(self.tuning, matrices)
+        tables = eqx.tree_at(lambda t: t.scale, self.tables, qp.unit)
         now = Core(self.layout, self.tuning, coefficients, qp, tables, self.size, self.switching)
         return now.consider(state, sample, gap, search)
 

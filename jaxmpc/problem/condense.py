@@ -120,6 +120,11 @@ class CondensedQp(eqx.Module):
         return np.arange(self.steep.shape[-2], dtype=float)[:, None]
 
     @property
+    def unit(self) -> Float[Array, ""]:
+        """Of the objective, see `relaxed.gap.closes`."""
+        return jnp.maximum(jnp.max(jnp.diagonal(self.curvature, axis1=-2, axis2=-1), axis=-1), 1e-12)
+
+    @property
     def theta(self) -> Float[Array, "prediction n"]:
         """Rows of t = theta x + t0; one copy per lane where tunings are batched, so not for the solvers."""
         return self.response * self.scale[..., None, :]
