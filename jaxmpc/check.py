@@ -23,6 +23,14 @@ def is_count(value: Any) -> bool:
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= 1)
 
 
+def as_floats(path: str, value: Any, expected: str) -> np.ndarray:
+    """A copy as an array of floats, or an `InputError`."""
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(path, value, expected) from None
+
+
 def check_keys(path: str, body: Container, keys: Iterable[str]) -> None:
     """Refuse a JSON object without one of the keys."""
     for key in keys:

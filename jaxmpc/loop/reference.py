@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.check import is_number
+from jaxmpc.check import as_floats, is_number
 from jaxmpc.errors import InputError
 
 
@@ -111,10 +111,7 @@ class Reference:
 
 def _numbers(field: str, given, dimensions: int, expected: str) -> np.ndarray:
     """A finite float array of so many dimensions, or an InputError that names the first bad entry."""
-    try:
-        array = np.array(given, dtype=np.float64)
-    except (ValueError, TypeError):
-        raise InputError(field, given, f"{expected}, rows of equal length") from None
+    array = as_floats(field, given, f"{expected}, rows of equal length")
     if array.ndim != dimensions:
         raise InputError(field, f"shape {list(array.shape)}", f"{dimensions} dimensions: {expected}")
     bad = np.argwhere(~np.isfinite(array))

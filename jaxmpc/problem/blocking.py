@@ -41,6 +41,7 @@ def block_members(structure: Structure) -> Float[np.ndarray, "sample block"]:
     return np.repeat(np.eye(structure.block_count), structure.blocks, axis=0)
 
 
+@functools.lru_cache(maxsize=64)
 def coupled_blocks(structure: Structure) -> Bool[np.ndarray, " block"]:
     """Blocks whose move is coupled to the one before by an oscillation row (6.16).
 

@@ -18,7 +18,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxmpc.check import is_number
+from jaxmpc.check import as_floats, is_number
 from jaxmpc.errors import InputError
 from jaxmpc.process.actuator import check_actuator, move_choke
 from jaxmpc.process.well.equations import (
@@ -299,9 +299,6 @@ def check_inputs(choke, lift, disturbance=0.0) -> None:
     for name, value, low, high, expected in limits:
         if isinstance(value, Tracer):
             continue
-        try:
-            number = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise InputError(name, value, expected) from None
+        number = as_floats(name, value, expected)
         if not np.isfinite(number).all() or (number < low).any() or (number > high).any():
             raise InputError(name, value, expected)

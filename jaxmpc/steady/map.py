@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxmpc.check import check_keys
+from jaxmpc.check import as_floats, check_keys
 from jaxmpc.errors import InputError
 from jaxmpc.files import read_json, write_atomically
 
@@ -50,7 +50,7 @@ class SteadyMap:
 
     def __post_init__(self):
         for key, unit in (("choke", "%"), ("lift", "m3/h")):
-            grid = _array(f"map.{key}", getattr(self, key), f"two or more increasing values [{unit}]")
+            grid = as_floats(f"map.{key}", getattr(self, key), f"two or more increasing values [{unit}]")
             if grid.ndim != 1 or len(grid) < 2 or not np.isfinite(grid).all() or (np.diff(grid) <= 0).any():
                 raise InputError(f"map.{key}", grid.tolist(), f"two or more increasing values [{unit}]")
             object.__setattr__(self, key, grid)
@@ -67,7 +67,7 @@ class SteadyMap:
             if len(getattr(self, key)) != count:
                 raise InputError(f"map.{key}", list(getattr(self, key)), f"{count} units, one per name")
         shape = (len(self.cv_names), len(self.lift), len(self.choke))
-        cv = _array("map.cv", self.cv, f"numbers of shape {list(shape)}, CV by lift by choke")
+        cv = as_floats("map.cv", self.cv, f"numbers of shape {list(shape)}, CV by lift by choke")
         if cv.shape != shape or np.isinf(cv).any():
             raise InputError(
                 "map.cv", f"shape {list(cv.shape)}", f"numbers of shape {list(shape)}, none infinite"
@@ -181,10 +181,3 @@ def _with_null(values):
     if isinstance(values, list):
         return [_with_null(value) for value in values]
     return None if np.isnan(values) else values
-
-
-def _array(path: str, value, expected: str) -> np.ndarray:
-    try:
-        return np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(path, value, expected) from None

@@ -21,6 +21,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from jaxmpc.check import as_floats
 from jaxmpc.errors import InputError
 from jaxmpc.files import read_json, write_atomically
 
@@ -253,10 +254,7 @@ def check_parameters(parameters: WellParameters, path: str = "well") -> WellPara
     """
     signed = {"choke_linear", "choke_quick", "perforation_depth"}
     for field in fields(parameters):
-        try:
-            value = np.asarray(getattr(parameters, field.name), dtype=np.float64)
-        except (TypeError, ValueError):
-            raise InputError(f"{path}.{field.name}", getattr(parameters, field.name), "a number") from None
+        value = as_floats(f"{path}.{field.name}", getattr(parameters, field.name), "a number")
         if not np.isfinite(value).all() or (field.name not in signed and not (value > 0).all()):
             kind = "finite" if field.name in signed else "finite and positive"
             raise InputError(f"{path}.{field.name}", value.tolist(), f"a {kind} number (SI units)")
