@@ -20,8 +20,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmpc.check import check_keys
 from jaxmpc.errors import InputError
-from jaxmpc.files import check_target
+from jaxmpc.files import check_target, read_json
 from jaxmpc.model.step_response import FORMAT, StepResponseModel, make_model
 from jaxmpc.process.plant import STATE_SCALE, JaxOps, check_inputs, rates, runge_kutta, steady_state
 from jaxmpc.process.well.equations import (
@@ -120,10 +121,7 @@ def load_step_data(path: str | Path) -> StepData:
     Raises:
         InputError: naming the field that is wrong.
     """
-    try:
-        body = json.loads(Path(path).read_text())
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError("step-response file", str(path), f"a readable JSON file ({error})") from error
+    body = read_json("step-response file", path)
     if not isinstance(body, dict):
         raise InputError("step-response file", str(path), "a JSON object")
     if body.get("format") == FORMAT:
@@ -132,9 +130,7 @@ def load_step_data(path: str | Path) -> StepData:
         coefficients = np.asarray(table.coefficients)
     else:
         keys = ("coefficients", "sampling_seconds", "cv", "mv")
-        for key in keys:
-            if key not in body:
-                raise InputError(f"data.{key}", "nothing", "a value (the key is missing)")
+        check_keys("data", body, keys)
         table = make_model(*(body[key] for key in keys), path="data")
         point = body.get("working_point", {})
         first, coefficients = np.split(np.asarray(table.coefficients), [1], axis=-1)

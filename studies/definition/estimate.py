@@ -9,18 +9,17 @@ from __future__ import annotations
 import dataclasses
 import statistics
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 # The table: measured on 2 CPU cores with chunks of 64 scenarios and the thesis tuning. Smaller chunks are slower per
 # scenario, and tunings that move the choke readily take several times as long.
 SAMPLES_PER_SECOND = {"continuous": 4000.0, "mixed-integer": 800.0}  # samples of one scenario
-COMPILE_SECONDS = 20.0  # more for the first chunk of a group
 MODEL_SECONDS = 1.0  # identification of one model
 
 
 def chunk_seconds(kind: str, samples: int, lanes: int) -> float:
-    """What the table expects of one chunk without compilation [s]; `lanes` has its padding too."""
+    """What the table expects of one chunk [s], compilation never counted; `lanes` has its padding too."""
     return lanes * samples / SAMPLES_PER_SECOND[kind]
 
 
@@ -33,22 +32,19 @@ class Work:
     seconds: Sequence[float]  # `chunk_seconds` of every group [s]
 
     def costs(self, done: Mapping[int, Mapping[str, Any]]) -> list[float]:
-        """Seconds that one worker needs for a chunk of each group, without compilation.
+        """Seconds that one worker needs for a chunk of each group.
 
-        A group with stored chunks has their mean, without the first one of every process, which compiled; where there
-        are no others, `COMPILE_SECONDS` are taken off it. A group without any has what the table expects, times measured
-        over expected of groups with its kind of controller (of all groups, where none of its kind is measured).
+        A group with stored chunks has their mean. A group without any has what the table expects, times measured over
+        expected of groups with its kind of controller (of all groups, where none of its kind is measured).
 
         Args:
             done: facts of stored chunks, as `chunk.ChunkResult` has them; those without ``wall_time`` were not computed.
         """
-        times: dict[int, list[tuple[Any, float]]] = {}
+        times: dict[int, list[float]] = {}
         for chunk in sorted(done):
-            facts = done[chunk]
-            if "wall_time" in facts:
-                process = facts.get("host"), facts.get("process")
-                times.setdefault(self.groups[chunk], []).append((process, float(facts["wall_time"])))
-        measured = {group: _mean(pairs, self.seconds[group]) for group, pairs in times.items()}
+            if "wall_time" in done[chunk]:
+                times.setdefault(self.groups[chunk], []).append(float(done[chunk]["wall_time"]))
+        measured = {group: statistics.fmean(seconds) for group, seconds in times.items()}
         pace = {group: seconds / self.seconds[group] for group, seconds in measured.items()}
         costs = []
         for group, (kind, expected) in enumerate(zip(self.kinds, self.seconds, strict=True)):
@@ -58,22 +54,9 @@ class Work:
         return costs
 
     def rest(self, done: Mapping[int, Mapping[str, Any]]) -> float:
-        """Seconds that one worker needs for all chunks that are not in `done`; groups without chunks compile first."""
+        """Seconds that one worker needs for all chunks that are not in `done`, as for `costs`."""
         costs = self.costs(done)
-        missing = [group for chunk, group in enumerate(self.groups) if chunk not in done]
-        compiled = {self.groups[chunk] for chunk, facts in done.items() if "wall_time" in facts}
-        return sum(costs[group] for group in missing) + COMPILE_SECONDS * len(set(missing) - compiled)
-
-
-def _mean(pairs: Iterable[tuple[Any, float]], expected: float) -> float:
-    """Mean time of chunks without compilation."""
-    by_process: dict[Any, list[float]] = {}
-    for process, seconds in pairs:
-        by_process.setdefault(process, []).append(seconds)
-    if later := [seconds for times in by_process.values() for seconds in times[1:]]:
-        return statistics.fmean(later)
-    mean = statistics.fmean(times[0] for times in by_process.values())
-    return min(mean, max(mean - COMPILE_SECONDS, expected))
+        return sum(costs[group] for chunk, group in enumerate(self.groups) if chunk not in done)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +67,7 @@ class Description:
     scenarios: int
     group_sizes: tuple[int, ...]  # scenarios of every group
     chunks: int
-    compilations: int  # compiled programs, one per group
+    compilations: int  # compiled programs; groups of one size share theirs
     models: int  # step-response models to identify
     samples: int  # samples of all scenarios together
     stored_bytes: int  # key figures and trajectories before compression [B]

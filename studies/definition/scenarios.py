@@ -18,6 +18,7 @@ from jaxmpc import html
 from jaxmpc.controller.measurement import SensorFault, fault_errors
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.trajectory import AXES
+from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning, make_tuning
 from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES, WellParameters
@@ -73,12 +74,13 @@ class Scenario:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Group:
-    """Scenarios that one compiled program computes.
+    """Scenarios that one compiled program computes with one matrix of responses where their model is the same.
+
+    Groups of one size share the program; a batch of several structures would lose what makes its Newton steps fast.
 
     Attributes:
         kind, actuator, structure, samples: what all of them have.
         has_limits: whether they have a finite CV limit.
-        whole_steps: most steps of a whole choke move; 0 for continuous moves.
         switching: whether bad measurements may switch a CV off.
         points: distinct working points of their models.
         scenarios: their numbers, increasing.
@@ -89,10 +91,15 @@ class Group:
     structure: Structure
     samples: int
     has_limits: bool
-    whole_steps: int
     switching: bool
     points: tuple[tuple[float, float], ...]
     scenarios: np.ndarray
+
+    @property
+    def program(self) -> tuple[Any, ...]:
+        """What it is compiled for, besides the number of lanes."""
+        size, whole = Size.of(self.structure, models.SAMPLES), bool(self.structure.integer_mvs)
+        return size, whole, self.actuator, self.has_limits, self.switching, len(self.points) == 1
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -224,7 +231,7 @@ class Study:
             scenarios=self.count,
             group_sizes=tuple(len(group.scenarios) for group in self.groups),
             chunks=len(self.chunks),
-            compilations=len(self.groups),
+            compilations=len({(*group.program, self.lanes(i)) for i, group in enumerate(self.groups)}),
             models=len(self.model_points),
             samples=sum(len(group.scenarios) * group.samples for group in self.groups),
             stored_bytes=self.count * (KEY_FIGURES + kept * points) * NUMBER_BYTES,
@@ -320,16 +327,12 @@ def _columns(table: AxisTable) -> tuple[Column, ...]:
 def _groups(inputs: Inputs, count: int) -> tuple[Group, ...]:
     tuning = inputs.tuning
     limited = np.any(np.isfinite(tuning["cv_low"]) | np.isfinite(tuning["cv_high"]), axis=1)
-    reach = np.maximum(-tuning["move_low"][:, 0], tuning["move_high"][:, 0])  # of the choke [%]
     switching = np.any(np.isfinite(tuning["bad_limit"]), axis=1)
-    members: dict[tuple[Any, Any, Any, int, bool, int, bool], list[int]] = {}
+    members: dict[tuple[Any, Any, Any, int, bool, bool], list[int]] = {}
     for k in range(count):
         variant = inputs.variants[inputs.variant[k]]
-        step = variant.structure.integer_step[0]
-        farthest = float(min(row(reach, k), row(tuning["mv_high"], k)[0] - row(tuning["mv_low"], k)[0], 1e6))
-        steps = int(farthest / step + 1e-9) if step else 0
         same = variant.kind, variant.actuator, variant.structure, variant.samples
-        members.setdefault((*same, bool(row(limited, k)), steps, bool(row(switching, k))), []).append(k)
+        members.setdefault((*same, bool(row(limited, k)), bool(row(switching, k))), []).append(k)
     groups = []
     for key, scenarios in members.items():
         points = dict.fromkeys(tuple(row(inputs.point, k).tolist()) for k in scenarios)

@@ -44,8 +44,10 @@ def _(mo):
 def _(mo):
     import contextlib
     import queue
+    import time
 
-    from jaxmpc.programs.compilation import compiled_since, told
+    from jaxmpc.programs.clock import Clock
+    from jaxmpc.programs.compilation import told
 
     @contextlib.contextmanager
     def compilation_shown():
@@ -66,7 +68,7 @@ def _(mo):
             thread.join()
             mo.output.clear()
 
-    return compilation_shown, compiled_since
+    return Clock, compilation_shown, time
 
 
 @app.cell
@@ -150,10 +152,10 @@ def _(choices_panel, length, mo, model_panel, page, setpoint_panel, tuning_panel
 
 @app.cell
 def _(
+    Clock,
     InputError,
     blocking,
     compilation_shown,
-    compiled_since,
     controller,
     explore,
     length,
@@ -161,6 +163,7 @@ def _(
     preset,
     scenario,
     soft,
+    time,
     tuning,
 ):
     run, refused = None, None
@@ -179,10 +182,10 @@ def _(
                 compilation_shown(),
                 mo.status.progress_bar(total=7800, title="22 h", show_eta=True, remove_on_exit=True) as _bar,
             ):
-                _done, _compiled = [0], compiled_since()
+                _done, _clock = [0], Clock()
 
                 def _report(done, total):
-                    _bar.start_time += _compiled()
+                    _bar.start_time = time.time() - _clock.seconds
                     _bar.update(increment=done - _done[0])
                     _done[0] = done
 
