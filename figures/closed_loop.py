@@ -20,7 +20,7 @@ from figures import panels, style
 from jaxmpc.loop.trajectory import Trajectory
 from studies.definition.presets import CHOKE
 
-RUN = "run"  # name of the one controller in results of one run; `studies.notebooks.loop` says the same
+RUN = "run"  # name of the one controller in results of one run
 PINNED: dict[str, Any] = {"color": "#9A9A9A", "linewidth": 1.8, "label": "pinned", "zorder": 1.5}
 
 
@@ -68,15 +68,9 @@ def tracking(
     legend: bool = True,
     bins: int = 12,
 ) -> None:
-    """CVs with setpoint and deadzone, then MVs, the choke with what was demanded; a pinned run in grey behind.
+    """CVs with setpoint and deadzone, then MVs, the choke with what was demanded, a panel each; a pinned run in grey behind.
 
-    Args:
-        axes: one panel per CV and MV.
-        data: results.
-        controller: name of a run in them.
-        pinned: results of one controller `RUN` to compare with; only times of `data` are drawn.
-        legend: whether panels have legends of their own.
-        bins: numbers along a time axis, at most.
+    Of `pinned`, results of one controller `RUN`, only times of `data` are drawn. A time axis has at most `bins` numbers.
     """
     start, end = panels.span(data)
     cvs = panels.cv_names(data)
@@ -106,6 +100,8 @@ def of_trajectory(trajectory: Trajectory, deadzone: Any, kind: str, actuator: st
             "measurement": (("time", "cv"), trajectory.cv),
             "position": (("time", "mv"), trajectory.mv),
             "demand": (("time", "mv"), trajectory.mv_demand),
+            "move": (("time", "mv"), trajectory.move),
+            "bias": (("time", "cv"), trajectory.bias),
             "setpoint": (("time", "cv"), trajectory.setpoint),
         },
         {

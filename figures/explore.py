@@ -34,14 +34,7 @@ TITLES = {X: "choke travel [%]", Y: "mean deviation / thesis deadzone [1]"}
 def tracking(
     data: xr.Dataset, controller: str = RUN, pinned: xr.Dataset | None = None, wide: bool = False
 ) -> Figure:
-    """CVs with setpoint and deadzone above, MVs below; a pinned run in grey behind.
-
-    Args:
-        data: results.
-        controller: name of a run in them.
-        pinned: results of one controller `RUN` to compare with; only times of `data` are drawn.
-        wide: for the width of the page instead of two thirds of it.
-    """
+    """CVs with setpoint and deadzone above, MVs below, as `closed_loop.tracking`; `wide` for the width of the page."""
     used = data.sizes["cv"], data.sizes["mv"]
     drawn, axes = _panels(2, max(used), 9.6 if wide else 6.9, 4.2 if wide else 4.5)
     shown = [ax for row, count in zip(axes, used, strict=True) for ax in row[:count]]
@@ -54,13 +47,7 @@ def tracking(
 
 @style.house_style
 def planned(data: xr.Dataset, time: float, controller: str = RUN) -> Figure:
-    """The plan made at a time, as in figure 25: rates, inputs and moves; what came of it pale.
-
-    Args:
-        data: results with plans.
-        time: of the plan [s].
-        controller: name of a run in them.
-    """
+    """The plan made at a time [s], as in figure 25: rates, inputs and moves; what came of it pale."""
     plan = plan_at(data, controller, time)
     drawn, axes = _panels(3, 2, 9.6, 5.2)
     shown = max(plan.time - BEFORE, 0.0), float(plan.cv_time[-1])
@@ -131,9 +118,8 @@ def stored(store: str | Path, number: int) -> xr.Dataset:
     stored_as = ["measurement", "position", "setpoint"]
     missing = [name for name in stored_as if name not in whole]
     if missing:
-        raise InputError(
-            "store.trajectories", missing, "stored cv, mv and setpoint", "Run the scenario again"
-        )
+        expected = "stored cv, mv and setpoint"
+        raise InputError("store.trajectories", missing, expected, "Run the scenario again")
     kinds, actuators = controller_of(whole)
     place = int(np.flatnonzero(whole.scenario.values == number)[0])
     one = whole[stored_as].sel(scenario=number).load()
@@ -152,15 +138,15 @@ def scatter(table: pd.DataFrame) -> Any:
     varying = [str(name) for name in table.columns if name not in ("best", "group", "number", X, Y)]
     many = len(set(table["group"])) > len(_COLOURS)
     legend = alt.Legend(title=table.attrs.get("group"), titleLimit=400, orient="top")
+    scale = alt.Scale(range=_COLOURS)
+    colour = alt.value(style.BLUE) if many else alt.Color("group:N", scale=scale, sort=None, legend=legend)
     return (
         alt.Chart(table)
         .mark_point(filled=True, size=90, strokeWidth=1.6, opacity=0.9)
         .encode(
             x=alt.X(f"{X}:Q", title=TITLES[X], scale=alt.Scale(zero=False)),
             y=alt.Y(f"{Y}:Q", title=TITLES[Y], scale=alt.Scale(zero=False)),
-            color=alt.value(style.BLUE)
-            if many
-            else alt.Color("group:N", scale=alt.Scale(range=_COLOURS), sort=None, legend=legend),
+            color=colour,
             stroke=alt.condition("datum.best == 'on the front'", alt.value("black"), alt.value("white")),
             tooltip=[*varying, *(alt.Tooltip(f"{k}:Q", title=TITLES[k], format=",.4g") for k in (X, Y))],
         )
@@ -199,12 +185,9 @@ def _panels(rows: int, columns: int, width: float, height: float) -> tuple[Figur
 
 def _deadzone(data: xr.Dataset, place: int, cv: str) -> float:
     """Half width of the deadzone of a scenario; 0 without Soft MPC."""
-
-    def of(key: str) -> Any:
-        return data[key].values[place] if key in data.coords else setting(data, key)
-
-    hard = of("soft") in (False, "false") or str(of("preset")).startswith("no-soft")
-    return 0.0 if hard else float(of(f"tuning.deadzone.{cv}"))
+    one = data.isel(scenario=[place])  # an axis of one value is a setting
+    hard = setting(one, "soft") in (False, "false") or str(setting(one, "preset")).startswith("no-soft")
+    return 0.0 if hard else float(setting(one, f"tuning.deadzone.{cv}"))
 
 
 def _plain(name: str) -> str:

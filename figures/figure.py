@@ -24,9 +24,9 @@ class FigureEntry:
         id: ``10`` for thesis figure 10, or a name.
         title: what it shows.
         study: name in `studies.thesis.catalogue.STUDIES` of the study whose results it reads; None if it reads none.
-        name: of its files.
         function: makes it from the results and `arguments`; its docstring begins with what is drawn.
         caption: one to three sentences on what to see, or a function of the results and `arguments` that gives them.
+        slug: what its files are called behind ``figure_10_``; those of a figure with a name have that name.
         needs: controllers whose runs must be finished.
         arguments: for `function` and `caption` beside the results.
     """
@@ -34,11 +34,16 @@ class FigureEntry:
     id: str
     title: str
     study: str | None
-    name: str
     function: Callable[..., Figure]
     caption: str | Callable[..., str]
+    slug: str = ""
     needs: tuple[str, ...] = ()
     arguments: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        return f"figure_{self.id}_{self.slug}" if self.slug else self.id.replace("-", "_")
 
     @property
     def source(self) -> str:

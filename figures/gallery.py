@@ -14,11 +14,11 @@ import xarray as xr
 
 from figures import style
 from figures.figure import FigureEntry
-from figures.produce import study_folder
-from figures.registry import FIGURES, check_ids
+from figures.produce import check_asked, study_folder
+from figures.registry import FIGURES
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
-from studies.definition.comparison import PLANTS, PlantKind
+from studies.definition.comparison import PlantKind
 from studies.store.reading import open_results
 
 PAGE = "index.html"
@@ -49,28 +49,34 @@ def write_gallery(
         InputError: for an unknown id, a figure or results that are missing, or a page of more than 10 MB; before
             anything is written.
     """
-    ids = check_ids(ids)
-    if plant not in PLANTS:
-        raise InputError("plant", plant, f"one of {', '.join(PLANTS)}")
-    out = Path(out)
-    for id in ids:
-        picture = out / f"{FIGURES[id].name}.png"
+    ids = check_asked(ids, plant)
+    entries = [FIGURES[id] for id in ids]
+    pictures = [Path(out) / f"{entry.name}.png" for entry in entries]
+    for entry, picture in zip(entries, pictures, strict=True):
         if not picture.is_file():
-            raise InputError("out", str(picture), f"the picture of figure {id}", "Draw the figures first")
-    read: dict[str, xr.Dataset] = {}
-    sections = []
-    for id in ids:
-        entry, data = FIGURES[id], None
-        if entry.study is not None:
-            if entry.study not in read:
-                read[entry.study] = open_results(study_folder(entry.study, results, quick, plant)).load()
-            data = read[entry.study]
-        picture = (out / f"{entry.name}.png").read_bytes()
-        sections.append(_section(entry, entry.text(data), picture, data, _command(entry, quick, plant)))
-    page = _page([FIGURES[id] for id in ids], sections, quick, plant)
+            expected = f"the picture of figure {entry.id}"
+            raise InputError("out", str(picture), expected, "Draw the figures first")
+    read: dict[str | None, xr.Dataset | None] = {None: None}
+    for entry in entries:
+        if entry.study is not None and entry.study not in read:
+            read[entry.study] = open_results(study_folder(entry.study, results, quick, plant)).load()
+    options = (" --quick" if quick else "") + (f" --plant {plant}" if plant != "fmu" else "")
+    blanks = {
+        "contents": "\n".join(
+            f'<li><a href="#figure-{html.escape(entry.id)}">{html.escape(heading(entry))}</a></li>'
+            for entry in entries
+        ),
+        "well": "an FMU of the well" if plant == "fmu" else "the JAX twin of the well",
+        "length": "shortened studies" if quick else "full studies",
+        "body": "\n".join(
+            _section(entry, picture.read_bytes(), read[entry.study], options)
+            for entry, picture in zip(entries, pictures, strict=True)
+        ),
+    }
+    page = string.Template(TEMPLATE.read_text(encoding="utf-8")).substitute(blanks)
     if len(page.encode()) > LARGEST:
         raise InputError("figure", ids, "figures of 10 MB together", "Ask for fewer of them")
-    return write_atomically(out / PAGE, page)
+    return write_atomically(Path(out) / PAGE, page)
 
 
 def heading(entry: FigureEntry) -> str:
@@ -78,12 +84,8 @@ def heading(entry: FigureEntry) -> str:
     return f"Figure {entry.id}: {entry.title}" if entry.id.isdigit() else entry.title.capitalize()
 
 
-def _command(entry: FigureEntry, quick: bool, plant: PlantKind) -> str:
-    options = (" --quick" if quick else "") + (f" --plant {plant}" if plant != "fmu" else "")
-    return f"jaxmpc figures {entry.id}{options if entry.study else ''}"
-
-
-def _section(entry: FigureEntry, caption: str, picture: bytes, data: xr.Dataset | None, command: str) -> str:
+def _section(entry: FigureEntry, picture: bytes, data: xr.Dataset | None, options: str) -> str:
+    command = f"jaxmpc figures {entry.id}{options if entry.study else ''}"
     study = "none: computed from the problem itself"
     if data is not None:
         study = f"{data.attrs.get('study', entry.study)} ({data.attrs.get('title', '')})"
@@ -91,7 +93,7 @@ def _section(entry: FigureEntry, caption: str, picture: bytes, data: xr.Dataset 
 <h2>{html.escape(heading(entry))}</h2>
 <figure>
 {style.image(picture, entry.alt)}
-<figcaption>{html.escape(caption)}</figcaption>
+<figcaption>{html.escape(entry.text(data))}</figcaption>
 </figure>
 <dl>
 <dt>Study</dt><dd>{html.escape(study)}</dd>
@@ -100,14 +102,3 @@ def _section(entry: FigureEntry, caption: str, picture: bytes, data: xr.Dataset 
 </dl>
 <p class="up"><a href="#contents">Contents</a></p>
 </section>"""
-
-
-def _page(entries: list[FigureEntry], sections: list[str], quick: bool, plant: PlantKind) -> str:
-    contents = "\n".join(
-        f'<li><a href="#figure-{html.escape(entry.id)}">{html.escape(heading(entry))}</a></li>'
-        for entry in entries
-    )
-    well = "an FMU of the well" if plant == "fmu" else "the JAX twin of the well"
-    length = "shortened studies" if quick else "full studies"
-    blanks = {"contents": contents, "well": well, "length": length, "body": "\n".join(sections)}
-    return string.Template(TEMPLATE.read_text(encoding="utf-8")).substitute(blanks)

@@ -38,24 +38,26 @@ def produce(
         InputError: for an unknown id or plant or a folder that cannot be written, before anything runs.
         MissingToolError: if the FMU is needed and cannot be built.
     """
-    ids = check_ids(ids)
-    if plant not in PLANTS:
-        raise InputError("plant", plant, f"one of {', '.join(PLANTS)}")
+    ids = check_asked(ids, plant)
     check_writable(out)
     studies = list(dict.fromkeys(FIGURES[id].study for id in ids))
     folders: dict[str | None, Path | None] = {None: None}
-    for study in studies:
-        if study is None:
-            continue
+    for study in filter(None, studies):
         folders[study] = study_folder(study, results, quick, plant)
         if is_current(study, results, quick, plant):
             say(f"{folders[study]}: complete.")
         else:
             folders[study] = catalogue.run_named(study, results, quick, plant, say=say)
-    paths = []
-    for study in studies:
-        paths += draw([id for id in ids if FIGURES[id].study == study], folders[study], out)
-    return paths
+    drawn = [draw([id for id in ids if FIGURES[id].study == study], folders[study], out) for study in studies]
+    return [path for paths in drawn for path in paths]
+
+
+def check_asked(ids: Iterable[str], plant: PlantKind) -> list[str]:
+    """The ids that are asked for, each once, or an `InputError` for an unknown id or plant."""
+    ids = check_ids(ids)
+    if plant not in PLANTS:
+        raise InputError("plant", plant, f"one of {', '.join(PLANTS)}")
+    return ids
 
 
 def study_folder(study: str, results: str | Path, quick: bool, plant: PlantKind) -> Path:
@@ -64,12 +66,5 @@ def study_folder(study: str, results: str | Path, quick: bool, plant: PlantKind)
 
 
 def is_current(study: str, results: str | Path, quick: bool, plant: PlantKind) -> bool:
-    """Whether every run of a study is stored, made from today's definition by today's code.
-
-    Args:
-        study: a key of `studies.thesis.catalogue.STUDIES`.
-        results: folder of all results.
-        quick: whether the shortened study is meant.
-        plant: of the study.
-    """
+    """Whether every run of a study of the catalogue is stored, made from today's definition by today's code."""
     return stored_as(catalogue.STUDIES[study](quick, plant), study_folder(study, results, quick, plant))

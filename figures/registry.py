@@ -44,10 +44,7 @@ FIGURES: dict[str, FigureEntry] = {
 
 
 def check_ids(ids: Iterable[str]) -> list[str]:
-    """The ids that are asked for, each once.
-
-    Args:
-        ids: keys of `FIGURES`, or ``["all"]``.
+    """The ids that are asked for, each once: keys of `FIGURES`, or ``["all"]``.
 
     Raises:
         InputError: for an unknown id, or none at all.
@@ -91,29 +88,16 @@ def draw(ids: Iterable[str], results: str | Path | xr.Dataset | None, out: str |
 
 
 def draw_study(folder: str | Path, study: str) -> list[Path]:
-    """Draw every figure of a study into its ``figures`` folder.
-
-    Args:
-        folder: of the study.
-        study: a key of `studies.thesis.catalogue.STUDIES`.
-
-    Returns:
-        The files written.
-    """
-    return draw(
-        [id for id, entry in FIGURES.items() if entry.study == study], folder, Path(folder) / "figures"
-    )
+    """Draw every figure of a study of the catalogue into the ``figures`` folder of its folder; the files written."""
+    ids = [id for id, entry in FIGURES.items() if entry.study == study]
+    return draw(ids, folder, Path(folder) / "figures")
 
 
 def _check_finished(entries: list[FigureEntry], data: xr.Dataset) -> None:
     needed = any(entry.needs for entry in entries)
     finished = set(map(str, completed(data).controller.values)) if needed else set()
     for entry in entries:
-        missing = [name for name in entry.needs if name not in finished]
+        missing = ", ".join(name for name in entry.needs if name not in finished)
         if missing:
-            raise InputError(
-                f"figure {entry.id}",
-                ", ".join(missing),
-                "finished runs in the results",
-                "Run the study again to finish them",
-            )
+            hint = "Run the study again to finish them"
+            raise InputError(f"figure {entry.id}", missing, "finished runs in the results", hint)

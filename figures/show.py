@@ -88,9 +88,7 @@ def _tuning(tuning: Tuning, structure: Any) -> Panels:
     if values[0].ndim != 1:
         raise InputError("tuning", f"shape {list(values[0].shape)}", "the tuning of one controller")
     axes = _axes(1, len(values[0]))
-    for c, (ax, (weight, square, linear, zone)) in enumerate(
-        zip(axes[0], zip(*values, strict=True), strict=True)
-    ):
+    for c, (ax, weight, square, linear, zone) in enumerate(zip(axes[0], *values, strict=True)):
         banded = square + linear > 0 and zone > 0
         e = np.linspace(-1.0, 1.0, 401) * (2.5 * zone if banded else 1.0)
         if banded:
@@ -147,7 +145,7 @@ def _runs(data: xr.Dataset) -> Panels:
     seconds = panels.time_axis(axes[-1, 0], *panels.span(data))
     labels = data.label if "label" in data.coords else data.controller
     curves = {
-        str(name): {"label": str(labels.sel(controller=name).item())} for name in data.controller.values
+        name: {"label": label} for name, label in zip(data.controller.values, labels.values, strict=True)
     }
     for ax, channel in zip(axes[:, 0], channels, strict=True):
         panels.compared(ax, data, channel, curves, seconds)

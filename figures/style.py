@@ -67,14 +67,7 @@ house_style = matplotlib.rc_context(RC)  # a decorator of what draws or writes
 
 
 def figure(rows: int, width: float = 7.6, row_height: float = 2.2, **options) -> tuple[Figure, list[Axes]]:
-    """A figure of stacked panels that share their horizontal axis.
-
-    Args:
-        rows: number of panels.
-        width: of the figure [inch].
-        row_height: of one panel [inch].
-        **options: for `matplotlib.figure.Figure.subplots`.
-    """
+    """A figure of stacked panels that share their horizontal axis; width of the figure and height of a panel [inch]."""
     drawn, axes = grid(rows, 1, width, row_height * rows + 0.5, **{"sharex": True, **options})
     return drawn, list(axes[:, 0])
 
@@ -117,6 +110,12 @@ def image(source: bytes, words: str, look: str = "") -> str:
     """A PNG as HTML that needs no further file; `words` say what it shows to readers who do not see it."""
     content = base64.b64encode(source).decode()
     return f'<img alt="{html.escape(words)}"{look} src="data:image/png;base64,{content}">'
+
+
+def spans(values: np.ndarray, ratio: float) -> bool:
+    """Whether the finite values are positive and the largest is more than `ratio` times the smallest."""
+    finite = values[np.isfinite(values)]
+    return len(finite) > 0 and finite.min() > 0 and finite.max() > ratio * finite.min()
 
 
 def colour(kind: str, actuator: str, position: int = 0) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -19,8 +20,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmpc.check import check_keys
 from jaxmpc.errors import InputError
-from jaxmpc.files import check_target
+from jaxmpc.files import check_target, read_json
 from jaxmpc.model.step_response import FORMAT, StepResponseModel, make_model
 from jaxmpc.process.plant import STATE_SCALE, JaxOps, check_inputs, rates, runge_kutta, steady_state
 from jaxmpc.process.well.equations import (
@@ -119,46 +121,34 @@ def load_step_data(path: str | Path) -> StepData:
     Raises:
         InputError: naming the field that is wrong.
     """
-    try:
-        body = json.loads(Path(path).read_text())
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError("step-response file", str(path), f"a readable JSON file ({error})") from error
+    body = read_json("step-response file", path)
     if not isinstance(body, dict):
         raise InputError("step-response file", str(path), "a JSON object")
     if body.get("format") == FORMAT:
         table = StepResponseModel.load(path)
-        point, coefficients = dict(table.working_point), np.asarray(table.coefficients)
+        point = dict(table.working_point)
+        coefficients = np.asarray(table.coefficients)
     else:
-        for key in ("coefficients", "sampling_seconds", "cv", "mv"):
-            if key not in body:
-                raise InputError(f"data.{key}", "nothing", "a value (the key is missing)")
-        table = make_model(
-            body["coefficients"], body["sampling_seconds"], body["cv"], body["mv"], path="data"
-        )
-        point, coefficients = body.get("working_point", {}), np.asarray(table.coefficients)
-        largest = np.abs(coefficients).max(axis=-1)
-        if (np.abs(coefficients[..., 0]) > 1e-6 * largest).any() or coefficients.shape[-1] < 2:
-            raise InputError(
-                "data.coefficients",
-                coefficients[..., 0].tolist(),
-                "entry 0, at the instant of the step, to be 0",
-            )
-        coefficients = coefficients[..., 1:]
-    for key, names, starts in (
-        ("cv", table.cv_names, ("gas", "oil")),
-        ("mv", table.mv_names, ("choke", "gas")),
-    ):
-        if len(names) != 2 or not all(n.lower().startswith(s) for n, s in zip(names, starts, strict=True)):
-            raise InputError(
-                f"data.{key}", list(names), f"two names that start with {starts[0]} and {starts[1]}"
-            )
+        keys = ("coefficients", "sampling_seconds", "cv", "mv")
+        check_keys("data", body, keys)
+        table = make_model(*(body[key] for key in keys), path="data")
+        point = body.get("working_point", {})
+        first, coefficients = np.split(np.asarray(table.coefficients), [1], axis=-1)
+        largest = np.abs(table.coefficients).max(axis=-1, keepdims=True)
+        if (np.abs(first) > 1e-6 * largest).any() or coefficients.shape[-1] == 0:
+            expected = "entry 0, at the instant of the step, to be 0"
+            raise InputError("data.coefficients", first[..., 0].tolist(), expected)
+    known = {"cv": (table.cv_names, ("gas", "oil")), "mv": (table.mv_names, ("choke", "gas"))}
+    for key, (names, starts) in known.items():
+        if len(names) != 2 or not all(map(str.startswith, map(str.lower, names), starts)):
+            raise InputError(f"data.{key}", list(names), f"two names that start with {' and '.join(starts)}")
     choke, lift = point.get("choke", DEFAULT_CHOKE), point.get("gas_lift", DEFAULT_LIFT)
     check_inputs(choke, lift)
     check_inputs(choke + STEPS[0], lift + STEPS[1])
-    known = [point.get(name) for name in CV_NAMES]
-    measured = None if None in known else np.array(known, dtype=np.float64)
+    said = [point.get(name) for name in CV_NAMES]
+    measured = None if None in said else np.array(said, dtype=np.float64)
     if measured is not None and not (np.isfinite(measured).all() and (measured > 0).all()):
-        raise InputError("data.working_point", known, "gas and oil rates above zero [m3/h]")
+        raise InputError("data.working_point", said, "gas and oil rates above zero [m3/h]")
     if (np.abs(coefficients).max(axis=-1) == 0).any():
         raise InputError("data.coefficients", "a response of zeros", "four responses that move")
     return StepData(coefficients, table.dt, float(choke), float(lift), measured)
@@ -178,14 +168,10 @@ def _measure(x, u, parameters):
 
 
 def simulate_steps(parameters: WellParameters, x0, point, seconds: int, samples: int):
-    """Step responses as a differentiable function of the parameters.
+    """Step responses as a differentiable function of the parameters of the well.
 
-    Args:
-        parameters: of the well.
-        x0: ``"8"``, its steady state at the working point.
-        point: ``"2"``, working point: choke [%] and lift [m3/h].
-        seconds: sampling interval [s].
-        samples: number of coefficients.
+    They begin in the steady state `x0` ``"8"`` at the working point ``"2"``, choke [%] and lift [m3/h]; a sample is a
+    whole number of seconds.
 
     Returns:
         ``(steady, response)``: steady CVs ``"cv"`` [m3/h], and S(1)..S(samples) ``"cv mv n"``.
@@ -280,64 +266,53 @@ def fit_well(data: StepData, prior: WellParameters | None = None, steps: int = 3
         if converged:
             break
     fitted = WellParameters(**parameters_to_dict(_unpack(theta, prior)))
-    return _report(fitted, np.asarray(response), data, cost, converged)
-
-
-def _report(parameters, response, data: StepData, cost, converged) -> Fit:
-    error = response - data.coefficients
-    variance = ((data.coefficients - data.coefficients.mean(axis=-1, keepdims=True)) ** 2).sum(axis=-1)
-    largest = np.abs(error).max(axis=-1) / np.abs(data.coefficients).max(axis=-1)
-    return Fit(parameters, 1 - (error**2).sum(axis=-1) / variance, largest, response, cost, converged)
+    target, response = data.coefficients, np.asarray(response)
+    unexplained = ((response - target) ** 2).mean(axis=-1) / target.var(axis=-1)
+    largest = np.abs(response - target).max(axis=-1) / np.abs(target).max(axis=-1)
+    return Fit(fitted, 1 - unexplained, largest, response, cost, converged)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Command line: fit the well to a file of step responses and write its parameters. Returns 0, or 2."""
-    parser = argparse.ArgumentParser(
-        prog="python -m identify.fit", description="Fit the well to step responses."
-    )
-    parser.add_argument(
-        "data", help="step responses: a model of `jaxmpc identify`, or a published table (JSON)"
-    )
-    parser.add_argument("--out", help="where to write the parameters (JSON); printed by default")
-    parser.add_argument("--prior", help="parameters to start from (JSON; default: the shipped well)")
-    parser.add_argument("--gas-rate", type=float, help="steady gas rate at the working point [m3/h]")
-    parser.add_argument("--oil-rate", type=float, help="steady oil rate at the working point [m3/h]")
+    text = "Fit the well to step responses."
+    parser = argparse.ArgumentParser(prog="python -m identify.fit", description=text)
+    for name, kind, what in (
+        ("data", str, "step responses: a model of `jaxmpc identify`, or a published table (JSON)"),
+        ("--out", str, "where to write the parameters (JSON); printed by default"),
+        ("--prior", str, "parameters to start from (JSON; default: the shipped well)"),
+        ("--gas-rate", float, "steady gas rate at the working point [m3/h]"),
+        ("--oil-rate", float, "steady oil rate at the working point [m3/h]"),
+    ):
+        parser.add_argument(name, type=kind, help=what)
     given = parser.parse_args(arguments)
     try:
         data = load_step_data(given.data)
         prior = load_parameters(given.prior) if given.prior else WellParameters()
-        if (given.gas_rate is None) != (given.oil_rate is None):
-            raise InputError("--gas-rate and --oil-rate", "one of them", "both or neither [m3/h]")
-        if given.gas_rate is not None:
-            if not (0 < given.gas_rate < np.inf and 0 < given.oil_rate < np.inf):
-                raise InputError(
-                    "--gas-rate and --oil-rate", (given.gas_rate, given.oil_rate), "above zero [m3/h]"
-                )
-            data = data._replace(rates=np.array([given.gas_rate, given.oil_rate]))
+        both, known = "--gas-rate and --oil-rate", (given.gas_rate, given.oil_rate)
+        if known.count(None) == 1:
+            raise InputError(both, "one of them", "both or neither [m3/h]")
+        if None not in known:
+            if not all(0 < rate < np.inf for rate in known):
+                raise InputError(both, known, "above zero [m3/h]")
+            data = data._replace(rates=np.array(known))
         if given.out:
             check_target("--out", given.out, filter(None, [given.data, given.prior]))
     except InputError as error:
         print(error, file=sys.stderr)
         return 2
     fit = fit_well(data, prior)
-    for i, cv in enumerate(CV_NAMES):
-        for j, mv in enumerate(MV_NAMES):
-            print(
-                f"{cv} <- {mv}: R2 {fit.r_squared[i, j]:.4f}, largest error "
-                f"{100 * fit.largest_error[i, j]:.1f} % of the peak",
-                file=sys.stderr,
-            )
+    for (cv, mv), fitted, error in zip(
+        itertools.product(CV_NAMES, MV_NAMES), fit.r_squared.flat, fit.largest_error.flat, strict=True
+    ):
+        said = f"{cv} <- {mv}: R2 {fitted:.4f}, largest error {100 * error:.1f} % of the peak"
+        print(said, file=sys.stderr)
     if data.rates is None:
         print("Steady rates were not given and kept near the prior's.", file=sys.stderr)
     if not fit.converged:
         print("The fit did not converge; this is the best that was found.", file=sys.stderr)
     if given.out:
-        facts = {
-            "r_squared": fit.r_squared.tolist(),
-            "largest_error": fit.largest_error.tolist(),
-            "converged": fit.converged,
-            "fitted_to": Path(given.data).name,
-        }
+        facts: dict = {key: getattr(fit, key).tolist() for key in ("r_squared", "largest_error")}
+        facts |= {"converged": fit.converged, "fitted_to": Path(given.data).name}
         print(save_parameters(fit.parameters, given.out, **facts), file=sys.stderr)
     else:
         print(json.dumps(parameters_to_dict(fit.parameters), indent=1))

@@ -93,9 +93,7 @@ def _compiler() -> str | None:
 
 
 def _cmake_options() -> dict[str, str]:
-    if os.name != "posix":
-        return {}
-    return {
+    options = {
         "CMAKE_C_FLAGS:STRING": COMPILER_FLAGS,
         "CMAKE_C_STANDARD_LIBRARIES:STRING": "-lm",
         # FMPy's project asks for a C++ compiler too and never uses it: any path that needs no check will do.
@@ -103,6 +101,7 @@ def _cmake_options() -> dict[str, str]:
         "CMAKE_CXX_COMPILER_WORKS:BOOL": "TRUE",
         "CMAKE_CXX_COMPILER_FORCED:BOOL": "TRUE",
     }
+    return options if os.name == "posix" else {}
 
 
 def _tools() -> dict[str, str]:
@@ -213,23 +212,19 @@ class FmuPlant:
 
     def _check_variables(self) -> None:
         """Refuse an FMU of something else."""
-        wanted = dict.fromkeys(
-            (*INPUT_NAMES, *OUTPUT_NAMES, *STATE_NAMES), "Float64" if self.fmi == 3 else "Real"
-        )
-        wanted[SWITCH] = "Boolean"
-        found = self._fmu.variables
+        number = "Float64" if self.fmi == 3 else "Real"
+        wanted = dict.fromkeys((*INPUT_NAMES, *OUTPUT_NAMES, *STATE_NAMES), number) | {SWITCH: "Boolean"}
+        found = {name: kind for name, (kind, _) in self._fmu.variables.items()}
         missing = [name for name in wanted if name not in found]
-        if missing:
-            raise InputError(
-                "plant.path", str(self.path), f"an FMU of the well (without {', '.join(missing)} it is not)"
+        wrong = [(name, kind) for name, kind in wanted.items() if found.get(name) != kind]
+        if wrong:
+            name, kind = wrong[0]
+            fault = (
+                f"without {', '.join(missing)} it is not"
+                if missing
+                else f"{name} is {found[name]}, not {kind}"
             )
-        for name, kind in wanted.items():
-            if found[name][0] != kind:
-                raise InputError(
-                    "plant.path",
-                    str(self.path),
-                    f"an FMU of the well ({name} is {found[name][0]}, not {kind})",
-                )
+            raise InputError("plant.path", str(self.path), f"an FMU of the well ({fault})")
 
     def init(
         self, choke: float = DEFAULT_CHOKE, lift: float = DEFAULT_LIFT, disturbance: float = 0.0, x=None
@@ -255,9 +250,7 @@ class FmuPlant:
         self._start(inputs, x)
         self.settled = True
         if x is None and (choke, lift, disturbance) != (DEFAULT_CHOKE, DEFAULT_LIFT, 0.0):
-            settled = self._settle()
-            # Start again, so that time is zero.
-            self._start(inputs, settled)
+            self._start(inputs, self._settle())  # again, so that time is zero
         self._position, self._lift = float(choke), float(lift)
         return self.measure()
 

@@ -89,10 +89,7 @@ class FmuProcess:
         self.variables = {name: (kind, causality) for name, (kind, causality) in facts["variables"].items()}
 
     def start(self, values: Mapping[str, Value] | None = None) -> None:
-        """Begin a new run at time zero.
-
-        Args:
-            values: start values by name.
+        """Begin a new run at time zero, with start values by name.
 
         Raises:
             PlantError: if the FMU fails; so do all methods.
@@ -114,17 +111,7 @@ class FmuProcess:
         outputs: Sequence[str] = (),
         count: int = 1,
     ) -> list[Any]:
-        """Set inputs, hold them over `count` steps of `dt` [s], and read outputs, in one round trip.
-
-        Args:
-            dt: length of a step [s].
-            inputs: values by name.
-            outputs: names.
-            count: of steps.
-
-        Returns:
-            Values of the outputs at the end.
-        """
+        """Set inputs by name, hold them over `count` steps of `dt` [s], and read outputs by name, in one round trip."""
         return self._ask(set=dict(inputs or {}), step=[dt, count], get=list(outputs))["values"]
 
     def _ask(self, **request: Any) -> dict[str, Any]:

@@ -47,26 +47,19 @@ INPUT_SEQUENCE = (
 VR_TIME, VR_INPUT, VR_SEPTIC_CONTROL, VR_OUTPUT, VR_STATE = 0, 1, 10, 20, 40
 UNITS = {
     "1": "",
-    "%": 'factor="0.01"',
-    "m3/h": f'm="3" s="-1" factor="{1 / 3600!r}"',
-    "bar": 'kg="1" m="-1" s="-2" factor="100000"',
-    "Pa": 'kg="1" m="-1" s="-2"',
-    "kg": 'kg="1"',
-    "s": 's="1"',
+    "%": ' factor="0.01"',
+    "m3/h": f' m="3" s="-1" factor="{1 / 3600!r}"',
+    "bar": ' kg="1" m="-1" s="-2" factor="100000"',
+    "Pa": ' kg="1" m="-1" s="-2"',
+    "kg": ' kg="1"',
+    "s": ' s="1"',
 }
 
 
-class _Positive(sympy.Function):
-    """max(x, 0), kept as one function so that SymPy does not split the model into cases."""
-
-
-class _Root(sympy.Function):
-    """Square root, kept as one function so that SymPy does not turn products of roots into pow()."""
-
-
 class _SymbolicOps:
-    sqrt = _Root
-    positive = _Positive
+    # Each kept as one function: SymPy would turn products of roots into pow() and split the model into cases.
+    sqrt = sympy.Function("sqrt")
+    positive = sympy.Function("positive")
 
 
 class _Printer(C99CodePrinter):
@@ -76,12 +69,6 @@ class _Printer(C99CodePrinter):
             product = f"power({self._print(expr.base)}, {abs(int(expr.exp))})"
             return product if expr.exp > 0 else f"(1.0/{product})"
         return super()._print_Pow(expr)
-
-    def _print__Positive(self, expr):
-        return f"positive({self._print(expr.args[0])})"
-
-    def _print__Root(self, expr):
-        return f"sqrt({self._print(expr.args[0])})"
 
 
 HELPERS = """static double positive(double a) { return a > 0.0 ? a : 0.0; }
@@ -96,7 +83,7 @@ static double power(double a, int n)
 
 def _function(name: str, result: str, expressions: list) -> str:
     """A C function that computes the expressions, with common subexpressions computed once."""
-    printer = _Printer()
+    printer = _Printer({"user_functions": {"sqrt": "sqrt", "positive": "positive"}})
     shared, reduced = sympy.cse(expressions, sympy.numbered_symbols("t"), order="none")
     lines = [f"    const double {symbol} = {printer.doprint(value)};" for symbol, value in shared]
     lines += [f"    {result}[{i}] = {printer.doprint(value)};" for i, value in enumerate(reduced)]
@@ -112,8 +99,8 @@ def model_header(parameters: WellParameters) -> str:
     symbols = {f.name: sympy.Symbol(f"p_{f.name}", real=True) for f in fields(WellParameters)}
     dx, y = model(_SymbolicOps, x, u, SimpleNamespace(**symbols))
     constants = [f"static const double p_{k} = {v!r};" for k, v in parameters_to_dict(parameters).items()]
-    start = ", ".join(repr(v) for v in start_state(parameters))
-    rows = ",\n".join("    {" + ", ".join(repr(v) for v in row) + "}" for row in INPUT_SEQUENCE)
+    start = ", ".join(map(repr, start_state(parameters)))
+    rows = ",\n".join("    {" + ", ".join(map(repr, row)) + "}" for row in INPUT_SEQUENCE)
     return "\n".join(
         [
             "/* Generated from the well's model function; do not edit. */",
@@ -153,21 +140,21 @@ class Variable(NamedTuple):
 
 def _variables(parameters: WellParameters) -> list[Variable]:
     """Every variable of the FMU, in the order of the model description."""
-    start, inputs = start_state(parameters), (DEFAULT_CHOKE, DEFAULT_LIFT, 0.0)
     switch = "false: the built-in input sequence drives the well; true: the inputs do"
-    rows = [
-        Variable(name, VR_INPUT + i, unit, text, "input", inputs[i])
-        for i, (name, unit, text) in enumerate(INPUTS)
+    inputs, nothing = (DEFAULT_CHOKE, DEFAULT_LIFT, 0.0), (None,) * len(OUTPUTS)
+
+    def group(rows, prefix: str, first: int, causality: str, start) -> list[Variable]:
+        return [
+            Variable(f"{prefix}{name}", first + i, unit, text, causality, start[i])
+            for i, (name, unit, text) in enumerate(rows)
+        ]
+
+    return [
+        *group(INPUTS, "", VR_INPUT, "input", inputs),
+        Variable("SepticControl", VR_SEPTIC_CONTROL, None, switch, "input"),
+        *group(OUTPUTS, "", VR_OUTPUT, "output", nothing),
+        *group(STATES, "state.", VR_STATE, "local", start_state(parameters)),
     ]
-    rows.append(Variable("SepticControl", VR_SEPTIC_CONTROL, None, switch, "input"))
-    rows += [
-        Variable(name, VR_OUTPUT + i, unit, text, "output") for i, (name, unit, text) in enumerate(OUTPUTS)
-    ]
-    rows += [
-        Variable(f"state.{name}", VR_STATE + i, unit, text, "local", start[i])
-        for i, (name, unit, text) in enumerate(STATES)
-    ]
-    return rows
 
 
 def _variable_xml(row: Variable, fmi: int) -> str:
@@ -179,10 +166,10 @@ def _variable_xml(row: Variable, fmi: int) -> str:
     )
     value = ' start="false"' if row.unit is None else f' unit="{row.unit}"'
     value += f' start="{row.start!r}"' if row.start is not None else ""
+    kind = "Boolean" if row.unit is None else "Float64" if fmi == 3 else "Real"
     if fmi == 3:
-        return f"    <{'Boolean' if row.unit is None else 'Float64'} {common}{value}/>"
-    element = "Boolean" if row.unit is None else "Real"
-    return f"    <ScalarVariable {common}><{element}{value}/></ScalarVariable>"
+        return f"    <{kind} {common}{value}/>"
+    return f"    <ScalarVariable {common}><{kind}{value}/></ScalarVariable>"
 
 
 def model_description(fmi: int, token: str, parameters: WellParameters) -> str:
@@ -194,10 +181,7 @@ def model_description(fmi: int, token: str, parameters: WellParameters) -> str:
     else:
         kinds = ("Output", "InitialUnknown")
         listed = "".join(f'<{kind} valueReference="{at}"/>' for kind in kinds for _, at in outputs)
-    units = (
-        f'    <Unit name="{name}"><BaseUnit {base}/></Unit>'.replace(" />", "/>")
-        for name, base in UNITS.items()
-    )
+    units = (f'    <Unit name="{name}"><BaseUnit{base}/></Unit>' for name, base in UNITS.items())
     return _filled(
         f"modelDescription{fmi}.xml",
         token=token,
@@ -216,11 +200,7 @@ def _filled(name: str, **words: object) -> str:
 
 
 def fmu_files(fmi: int, parameters: WellParameters) -> tuple[dict[str, str], str]:
-    """Everything in the FMU but its binary.
-
-    Args:
-        fmi: 2 or 3.
-        parameters: of the well.
+    """Everything in an FMU of FMI 2 or 3 but its binary.
 
     Returns:
         ``(files, token)``: contents by path inside the FMU, and the instantiation token, which is a digest of
@@ -233,9 +213,8 @@ def fmu_files(fmi: int, parameters: WellParameters) -> tuple[dict[str, str], str
     contents["sources/model.h"] = model_header(parameters)
     if fmi == 3:
         sources = "".join(f'<SourceFile name="{name}"/>' for name in (f"fmi{fmi}.c", "well.c"))
-        contents["sources/buildDescription.xml"] = _filled(
-            "buildDescription.xml", identifier=MODEL_IDENTIFIER, sources=sources
-        )
+        build = _filled("buildDescription.xml", identifier=MODEL_IDENTIFIER, sources=sources)
+        contents["sources/buildDescription.xml"] = build
     body = repr(sorted(contents.items())) + model_description(fmi, "", parameters)
     digest = hashlib.sha256(body.encode()).hexdigest()
     token = "{" + "-".join((digest[:8], digest[8:12], digest[12:16], digest[16:20], digest[20:32])) + "}"

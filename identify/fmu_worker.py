@@ -45,16 +45,9 @@ class RefusedError(Exception):
 
 
 def check_archive(path: Path, free: int) -> None:
-    """Refuse an archive that would leave its folder or fill the disk, from its table of contents.
+    """Refuse an archive that would leave its folder or fill the `free` bytes of the disk, from its table of contents.
 
     Unpacking stops at the sizes in the table, so that a table that lies does no harm.
-
-    Args:
-        path: of the archive.
-        free: space for its content [bytes].
-
-    Raises:
-        RefusedError: with the reason.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -93,11 +86,7 @@ def unpack(path: Path, folder: Path) -> None:
 
 
 def read_description(folder: Path) -> Any:
-    """FMPy's reading of the model description of a co-simulation FMU of FMI 2.0 or 3.0.
-
-    Raises:
-        RefusedError: if it is another kind of FMU, or not valid.
-    """
+    """FMPy's reading of the model description of a co-simulation FMU of FMI 2.0 or 3.0; refuses other kinds."""
     from fmpy import read_model_description
 
     try:
@@ -109,10 +98,8 @@ def read_description(folder: Path) -> Any:
         raise RefusedError(f"an FMU of FMI 2.0 or 3.0 (its version is {version})")
     if root.find("CoSimulation") is None:
         kinds = [kind for kind in ("ModelExchange", "ScheduledExecution") if root.find(kind) is not None]
-        raise RefusedError(
-            f"a co-simulation FMU (it has only: {', '.join(kinds) or 'nothing'})",
-            "Export it once more for co-simulation",
-        )
+        expected = f"a co-simulation FMU (it has only: {', '.join(kinds) or 'nothing'})"
+        raise RefusedError(expected, "Export it once more for co-simulation")
     try:
         return read_model_description(folder)
     except Exception as error:  # FMPy has no type of its own for most of what it finds
@@ -121,11 +108,7 @@ def read_description(folder: Path) -> Any:
 
 
 def library_of(folder: Path, description: Any) -> Path:
-    """The library for this machine.
-
-    Raises:
-        RefusedError: if there is none.
-    """
+    """The library for this machine; refuses an FMU without."""
     from fmpy import platform, platform_tuple, sharedLibraryExtension
 
     name = description.coSimulation.modelIdentifier
@@ -134,24 +117,16 @@ def library_of(folder: Path, description: Any) -> Path:
     if library.is_file():
         return library
     others = sorted(other.parent.name for other in folder.glob("binaries/*/*") if other.is_file())
+    has, hint = "none", ""
     if others:
-        raise RefusedError(
-            f"an FMU with a library for {here} (it has one for {', '.join(dict.fromkeys(others))})"
-        )
-    if any(folder.glob("sources/*")):
-        raise RefusedError(
-            f"an FMU with a library for {here} (it has only sources)", "Compile it: fmpy compile FILE.fmu"
-        )
-    raise RefusedError(f"an FMU with a library for {here} (it has none)")
+        has = f"one for {', '.join(dict.fromkeys(others))}"
+    elif any(folder.glob("sources/*")):
+        has, hint = "only sources", "Compile it: fmpy compile FILE.fmu"
+    raise RefusedError(f"an FMU with a library for {here} (it has {has})", hint)
 
 
 class Runner:
-    """The FMU of this process.
-
-    Args:
-        folder: for its files.
-        note: receives which call is being made.
-    """
+    """The FMU of this process, its files in a folder; the note receives which call is being made."""
 
     def __init__(self, folder: Path, note: mmap.mmap):
         self.folder, self._note = folder, note
@@ -183,9 +158,9 @@ class Runner:
                 instanceName="fmu",
             )
         except AttributeError as error:  # how ctypes says that a library has no such function
-            missing = str(error).rpartition(" ")[2]
+            missing = f"{str(error).rpartition(' ')[2]} is missing"
             raise RefusedError(
-                f"an FMU whose library has every function of FMI {self.fmi} ({missing} is missing)"
+                f"an FMU whose library has every function of FMI {self.fmi} ({missing})"
             ) from None
         except Exception as error:
             reason = str(error).replace(str(library), library.name).replace(str(self.folder) + os.sep, "")
@@ -196,10 +171,12 @@ class Runner:
         except Exception:
             token = "instantiationToken" if self.fmi == 3 else "GUID"
             foreign = described.guid.encode() not in library.read_bytes()
-            reason = f"the {token} {described.guid} of its description is not in its library" * foreign
-            raise RefusedError(
-                f"an FMU whose library lets itself be instantiated ({reason or 'it declined'})"
-            ) from None
+            reason = (
+                f"the {token} {described.guid} of its description is not in its library"
+                if foreign
+                else "it declined"
+            )
+            raise RefusedError(f"an FMU whose library lets itself be instantiated ({reason})") from None
         variables = {v.name: (v.type, v.causality) for v in described.modelVariables}
         return {"fmi": self.fmi, "token": described.guid, "variables": variables}
 

@@ -68,11 +68,7 @@ def settling(model: StepResponseModel) -> list[Settling]:
 
 
 def identity(plant: Any) -> tuple[str, str]:
-    """What a plant is, ``jax`` or ``fmu``, and a digest of everything that decides its responses.
-
-    Args:
-        plant: a `WellPlant`, or an `identify.fmu.FmuPlant`.
-    """
+    """What a plant is, ``jax`` or ``fmu``, and a digest of everything that decides its responses."""
     if isinstance(plant, WellPlant):
         return "jax", well_hash(plant.parameters)
     return "fmu", plant.token
@@ -91,13 +87,9 @@ def settling_notes(model: StepResponseModel) -> list[str]:
 def apply_sequence(
     plant: Any, choke: float, lift: float, demands: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Start a plant at a working point and apply a sequence of demands.
+    """Start a plant at a working point, choke [%] and lift [m3/h], and apply demands ``"sample 2"`` to it.
 
-    Args:
-        plant: a `WellPlant`, or any plant on the host with ``init(choke, lift)`` and ``step(mv)``.
-        choke: position at the start [%].
-        lift: rate at the start [m3/h].
-        demands: ``"sample 2"`` [%, m3/h].
+    The plant is a `WellPlant`, or any on the host with ``init(choke, lift)`` and ``step(mv)``.
 
     Returns:
         ``(cv, mv)``: measurements and applied inputs at the end of each sample, both ``"sample 2"``.
@@ -155,9 +147,8 @@ def identify_step_response(
         cv, mv = apply_sequence(plant, choke, lift, demands)
         made = mv[-1] - point
         if abs(made[j] - step) > 1e-9 * max(1.0, abs(step)):
-            raise InputError(
-                f"steps[{j}]", step, f"a step that the actuator makes ({MV_NAMES[j]} moved {made[j]})"
-            )
+            expected = f"a step that the actuator makes ({MV_NAMES[j]} moved {made[j]})"
+            raise InputError(f"steps[{j}]", step, expected)
         base = cv[SETTLE_SAMPLES - 1]
         responses.append((cv[SETTLE_SAMPLES:] - base).T / step)
     kind, digest = identity(plant)
@@ -167,17 +158,13 @@ def identify_step_response(
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "steps": [float(step) for step in steps],
     }
-    names = (*MV_NAMES, *CV_NAMES)
+    found = dict(zip((*MV_NAMES, *CV_NAMES), (choke, lift, *base.tolist()), strict=True))
+    units: dict[str, Any] = {"cv_units": CV_UNITS, "mv_units": MV_UNITS}
+    coefficients = np.stack(responses, axis=1)
     model = make_model(
-        np.stack(responses, axis=1),
-        plant.dt,
-        CV_NAMES,
-        MV_NAMES,
-        cv_units=CV_UNITS,
-        mv_units=MV_UNITS,
-        working_point=dict(zip(names, (choke, lift, *base.tolist()), strict=True)),
-        provenance=facts,
+        coefficients, plant.dt, CV_NAMES, MV_NAMES, **units, working_point=found, provenance=facts
     )
-    notes = settling_notes(model)
-    more = tuple({"settled": not notes, "notes": tuple(notes)}.items())
-    return dataclasses.replace(model, provenance=model.provenance + more)
+    notes = tuple(settling_notes(model))
+    return dataclasses.replace(
+        model, provenance=(*model.provenance, ("settled", not notes), ("notes", notes))
+    )

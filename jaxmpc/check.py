@@ -2,24 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Container, Iterable
+from typing import Any
+
 import numpy as np
-from numpy.typing import ArrayLike
 
 from jaxmpc.errors import InputError
 
 LARGEST = 1e30  # size of a number from which on it cannot be meant, and products of squares overflow
 
 
-def check_vector(path: str, value: ArrayLike, names: tuple[str, ...], unit: str) -> np.ndarray:
-    """A finite vector with one entry per name, or an `InputError`."""
-    array = np.asarray(value, dtype=np.float64)
-    if array.shape != (len(names),) or not sound(array).all():
-        raise InputError(
-            path,
-            np.asarray(value).tolist(),
-            f"{len(names)} finite numbers of size {LARGEST:g} at most [{unit}] for {', '.join(names)}",
-        )
-    return array
+def is_number(value: Any) -> bool:
+    """Whether it is a finite number; true and false are none."""
+    number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+    return number and bool(-np.inf < value < np.inf)
+
+
+def is_count(value: Any) -> bool:
+    """Whether it is a whole number, 1 or more."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= 1)
+
+
+def as_floats(path: str, value: Any, expected: str) -> np.ndarray:
+    """A copy as an array of floats, or an `InputError`."""
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(path, value, expected) from None
+
+
+def check_keys(path: str, body: Container, keys: Iterable[str]) -> None:
+    """Refuse a JSON object without one of the keys."""
+    for key in keys:
+        if key not in body:
+            raise InputError(f"{path}.{key}", "nothing", "a value (the key is missing)")
 
 
 def sound(values: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import json
 import math
 import os
 import secrets
@@ -48,6 +49,14 @@ def from_strict_json(value: Any) -> Any:
     if isinstance(value, str) and value.lstrip("'") in NOT_FINITE:
         return NOT_FINITE.get(value, value[1:])
     return value
+
+
+def read_json(field: str, path: str | Path) -> Any:
+    """The content of a JSON file, or an `InputError` that names the path."""
+    try:
+        return json.loads(Path(path).read_text())
+    except (OSError, ValueError, RecursionError) as error:  # no file, no text, no JSON
+        raise InputError(field, str(path), f"a readable JSON file ({error})") from error
 
 
 def write_atomically(path: str | Path, content: Content) -> Path:

@@ -58,16 +58,10 @@ def card(title: Any, *parts: str) -> Markup:
 
 
 def table(head: Sequence[Any], rows: Iterable[Sequence[Any]]) -> Markup:
-    """A table; an empty `head` gives none.
-
-    Args:
-        head: titles of the columns.
-        rows: cells, text or `Markup`.
-    """
+    """A table of cells, text or `Markup`; an empty `head` gives none."""
     top = "".join(f'<th style="{CELL};font-weight:600">{escape(cell)}</th>' for cell in head)
-    body = "".join(
-        "<tr>" + "".join(f'<td style="{CELL}">{escape(cell)}</td>' for cell in row) + "</tr>" for row in rows
-    )
+    cells = ("".join(f'<td style="{CELL}">{escape(cell)}</td>' for cell in row) for row in rows)
+    body = "".join(f"<tr>{row}</tr>" for row in cells)
     top = f"<thead><tr>{top}</tr></thead>" if head else ""
     return Markup(
         f'<table style="border-collapse:collapse;color:inherit;margin:2px 0 6px">{top}<tbody>{body}</tbody></table>'
@@ -83,27 +77,17 @@ def facts(pairs: Mapping[str, Any] | Iterable[tuple[str, Any]]) -> Markup:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Curve:
-    """A line of a chart.
+    """A line of a chart."""
 
-    Attributes:
-        y: ``"point"``.
-        held: whether a value holds until the next one.
-        dashed: whether it is drawn dashed in the colour of the text, as setpoints are.
-    """
-
-    y: Any
-    held: bool = False
-    dashed: bool = False
+    y: Any  # "point"
+    held: bool = False  # whether a value holds until the next one
+    dashed: bool = False  # in the colour of the text, as setpoints are
 
 
 def chart(label: str, curves: Sequence[Curve], width: int = 180, height: int = 48) -> Markup:
-    """Curves over a common, evenly spaced axis as inline SVG; gaps where a value is not finite.
+    """Curves over a common, evenly spaced axis as inline SVG [px]; gaps where a value is not finite.
 
-    Args:
-        label: what is drawn, for a tooltip and for screen readers.
-        curves: drawn one over the other.
-        width: [px].
-        height: [px].
+    The label says what is drawn, in a tooltip and to screen readers.
     """
     values = [np.asarray(curve.y, dtype=float).ravel() for curve in curves]
     finite = np.concatenate([v[np.isfinite(v)] for v in values]) if values else np.zeros(0)
@@ -111,10 +95,9 @@ def chart(label: str, curves: Sequence[Curve], width: int = 180, height: int = 4
     low, high = (low - 0.5, high + 0.5) if high - low <= 1e-12 * max(abs(high), 1e-300) else (low, high)
     parts = []
     if low < 0 < high:
-        zero = _place(0.0, low, high, height)
-        parts.append(
-            f'<line x1="0" x2="{width}" y1="{zero}" y2="{zero}" stroke="currentColor" stroke-opacity=".25"/>'
-        )
+        at = _place(0.0, low, high, height)
+        ends = f'x1="0" x2="{width}" y1="{at}" y2="{at}"'
+        parts.append(f'<line {ends} stroke="currentColor" stroke-opacity=".25"/>')
     colours = iter((LINE, SECOND, "#7f7f7f"))
     for curve, y in zip(curves, values, strict=True):
         colour = "currentColor" if curve.dashed else next(colours, LINE)
@@ -173,10 +156,8 @@ def step_response(model: Any) -> str:
     for c, cv in enumerate(model.cv_names):
         row: list[Any] = [named(model.cv_names, model.cv_units, c, "CV")]
         for m, mv in enumerate(model.mv_names):
-            response = np.concatenate([[0.0], steps[c, m]])
-            drawn = chart(
-                f"{cv} after a unit step of {mv}, {model.samples * model.dt:g} s", [Curve(response)]
-            )
+            words = f"{cv} after a unit step of {mv}, {model.samples * model.dt:g} s"
+            drawn = chart(words, [Curve(np.append(0.0, steps[c, m]))])
             row.append(Markup(f"{drawn}{escape('settles at ' + number(steps[c, m, -1]))}"))
         rows.append(row)
     head = ["", *(named(model.mv_names, model.mv_units, m, "MV") for m in range(len(model.mv_names)))]
@@ -185,13 +166,7 @@ def step_response(model: Any) -> str:
 
 
 def fields(title: str, values: Any, declared: Mapping[str, Any]) -> str:
-    """What an object of declared fields holds: value, unit, default and meaning of each.
-
-    Args:
-        title: of the table.
-        values: the object.
-        declared: a `jaxmpc.problem.declared.Declared` per field.
-    """
+    """What an object of declared fields holds, a `jaxmpc.problem.declared.Declared` each: value, unit, default, meaning."""
     rows = []
     for key, field in declared.items():
         default = "required" if field.default is None else number(field.default)
@@ -223,14 +198,10 @@ def trajectory(run: Any) -> str:
     """A `jaxmpc.loop.trajectory.Trajectory`: CVs with their setpoints, MVs, and how the samples were solved."""
     rows = []
     for c, name in enumerate(run.cv_names):
-        drawn = chart(
-            f"{name}, setpoint dashed",
-            [Curve(run.setpoint[:, c], held=True, dashed=True), Curve(run.cv[:, c])],
-            360,
-        )
-        rows.append(
-            [named(run.cv_names, run.cv_units, c, "CV"), drawn, _span(run.cv[:, c]) if run.samples else ""]
-        )
+        setpoint = Curve(run.setpoint[:, c], held=True, dashed=True)
+        drawn = chart(f"{name}, setpoint dashed", [setpoint, Curve(run.cv[:, c])], 360)
+        seen = _span(run.cv[:, c]) if run.samples else ""
+        rows.append([named(run.cv_names, run.cv_units, c, "CV"), drawn, seen])
     for m, name in enumerate(run.mv_names):
         drawn = chart(name, [Curve(run.mv[:, m], held=True)], 360)
         moved = f"{_span(run.mv[:, m])}, travel {number(np.abs(run.move[:, m]).sum())}" if run.samples else ""
@@ -264,11 +235,8 @@ def study(expanded: Any) -> str:
         if values.dtype.kind in "iuf" and len(distinct) > 6:
             shown = _span(values)
         rows.append([column.key, column.label, column.unit, len(distinct), shown])
-    return card(
-        f"Study: {expanded.title}",
-        facts(known),
-        table(["what varies", "in words", "unit", "values", "which"], rows) if rows else "",
-    )
+    varying = table(["what varies", "in words", "unit", "values", "which"], rows) if rows else ""
+    return card(f"Study: {expanded.title}", facts(known), varying)
 
 
 def _span(values: Any) -> str:

@@ -29,9 +29,10 @@ DOORS = {
     "zarr": ("studies/",),
     "google_crc32c": ("studies/store/",),
     "optuna": ("studies/search/run.py",),
-    "scipy": ("studies/bench/", "studies/definition/axes.py"),
+    "scipy": ("jaxmpc/integer/tighten.py", "studies/bench/", "studies/definition/axes.py"),
+    "clarabel": ("jaxmpc/integer/tighten.py", "studies/bench/peers.py"),
     **dict.fromkeys(
-        ("piqp", "clarabel", "osqp", "daqp", "qpax", "pyscipopt", "gurobipy"), ("studies/bench/peers.py",)
+        ("piqp", "osqp", "daqp", "qpax", "pyscipopt", "gurobipy"), ("studies/bench/peers.py",)
     ),
 }
 COLUMN = (

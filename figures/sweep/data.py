@@ -9,6 +9,7 @@ import dataclasses
 import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -153,10 +154,10 @@ def sweep_axes(data: xr.Dataset) -> list[SweepAxis]:
             continue
         if key in ("prediction_horizon", "control_horizon") and _decides(found.get("blocks"), values):
             continue
-        attrs = data[key].attrs
-        if values.dtype.kind == "f" and not np.isfinite(values).all():  # a limit that does not bind
-            values = np.array([f"{value:g}" for value in values], dtype=object)
-        axis = SweepAxis(key, attrs.get("long_name", key), attrs.get("units", ""), values)
+        axis = axis_of(data, key)
+        if axis.numeric and not np.isfinite(values.astype(float)).all():  # a limit that does not bind
+            texts = np.array([f"{value:g}" for value in values], dtype=object)
+            axis = dataclasses.replace(axis, values=texts)
         for i, known in enumerate(out):
             alike = known.numeric == axis.numeric and known.key != "controller"
             if alike and _decides(known.values, values) and _decides(values, known.values):
@@ -167,6 +168,12 @@ def sweep_axes(data: xr.Dataset) -> list[SweepAxis]:
     return out
 
 
+def axis_of(data: xr.Dataset, key: str) -> SweepAxis:
+    """A column of the study."""
+    attrs = data[key].attrs
+    return SweepAxis(key, attrs.get("long_name", key), attrs.get("units", ""), data[key].values)
+
+
 def _decides(first: np.ndarray | None, second: np.ndarray) -> bool:
     """Whether equal values of the first mean equal values of the second."""
     if first is None:
@@ -174,7 +181,7 @@ def _decides(first: np.ndarray | None, second: np.ndarray) -> bool:
     return len(set(zip(first.tolist(), second.tolist(), strict=True))) == len(set(first.tolist()))
 
 
-def setting(data: xr.Dataset, key: str):
+def setting(data: xr.Dataset, key: str) -> Any:
     """What the base of the study says of a key; its default if the base is silent, None if the store does not know."""
     if key in data.coords:  # an axis of one value
         return data[key].values[0]

@@ -19,11 +19,7 @@ from figures.sweep.data import load, sweep_axes
 
 
 def pages(data: xr.Dataset) -> dict[str, Callable[[], Figure]]:
-    """What draws the figures that fit a study, by the name of their files.
-
-    Args:
-        data: of `figures.sweep.data.load`.
-    """
+    """What draws the figures that fit a study, from `figures.sweep.data.load`, by the name of their files."""
     axes = sweep_axes(data)
     out: dict[str, Callable[[], Figure]] = {"pareto": functools.partial(wear.draw, data)}
     if maps.is_mismatch(axes):

@@ -17,6 +17,7 @@ from matplotlib.patches import Patch
 from figures import panels, style
 from figures.sweep import sheet
 from figures.sweep.data import SweepAxis, Variant, quantities, variants
+from figures.sweep.wear import SPREAD
 from studies.definition.presets import CHOKE
 
 FEWEST = 8  # scenarios of a variant, for a distribution
@@ -81,13 +82,10 @@ def _fan(ax: Axes, part: xr.Dataset, channel: str, seconds: float, colour: str) 
     at = bands(np.concatenate([one.isel(scenario=slice(i, i + ROWS)).values for i in starts]))
     t = part.time.values / seconds
     for low, high, alpha, label in LEVELS:
-        look: dict[str, Any] = {
-            "color": colour,
-            "alpha": alpha,
-            "step": None if cv else "post",
-            "linewidth": 0,
-        }
-        ax.fill_between(t, at[low], at[high], label=style.printed(f"{label} of the runs"), **look)
+        look: dict[str, Any] = {"color": colour, "alpha": alpha, "step": None if cv else "post"}
+        ax.fill_between(
+            t, at[low], at[high], linewidth=0, label=style.printed(f"{label} of the runs"), **look
+        )
     drawstyle = "default" if cv else "steps-post"
     ax.plot(t, at[2], color=colour, linewidth=1.2, label="median", drawstyle=drawstyle)
     if cv and "setpoint" in part.data_vars:
@@ -126,8 +124,7 @@ def distributions(data: xr.Dataset, found: list[Variant]) -> Figure:
                 said.append(number)
         ax.set_xlabel(title)
         ax.set_ylim(0, 103)
-        low, high = ax.get_xlim()
-        if low > 0 and high > 30 * low:
+        if style.spans(np.array(ax.get_xlim()), SPREAD):
             ax.set_xscale("log")
     grid[0, 0].set_ylabel(style.printed("share of the runs [%]"))
     legend = [Line2D([], [], color=v.colour, label=v.label) for v in found]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -56,11 +57,9 @@ def controller_parts(data: xr.Dataset) -> list[tuple[str, str, xr.Dataset]]:
 
 
 def cells(values: np.ndarray, at: list[tuple[np.ndarray, list]]) -> np.ndarray:
-    """Median of the values in each cell, ``"row column"``; NaN in an empty one.
+    """Median of the values ``"scenario"`` in each cell, ``"row column"``; NaN in an empty one.
 
-    Args:
-        values: ``"scenario"``.
-        at: rows, then columns: where each scenario is, and the distinct places.
+    `at` says for rows, then columns, where each scenario is, and the distinct places.
     """
     (rows, row_places), (columns, column_places) = at
     medians = pd.Series(values).groupby([rows, columns]).median().unstack()
@@ -68,13 +67,7 @@ def cells(values: np.ndarray, at: list[tuple[np.ndarray, list]]) -> np.ndarray:
 
 
 def draw(data: xr.Dataset, axes: tuple[SweepAxis, SweepAxis], label: str = "") -> Figure:
-    """Choke travel, reversals, and the mean deviation of each CV over two axes.
-
-    Args:
-        data: finished scenarios, of one controller.
-        axes: the horizontal and the vertical one, of these scenarios.
-        label: of the controller.
-    """
+    """Choke travel, reversals, and the mean deviation of each CV over a horizontal and a vertical axis; one controller."""
     across, up = axes
     shown = quantities(data, data.cv.values)
     shown.insert(1, ("choke reversals [1]", figure_of(data, "choke_reversals").values))
@@ -144,15 +137,9 @@ def heat(
     norm: Normalize | None = None,
     size: float | None = None,
 ) -> QuadMesh:
-    """One map; logarithmic colours for values of several magnitudes, numbers printed where they fit.
+    """One map of a table ``"row column"``, columns and rows between their borders, numbers [pt] printed where they fit.
 
-    Args:
-        ax: to draw on.
-        table: ``"row column"``.
-        borders: of the columns and of the rows.
-        centres: of the columns and of the rows.
-        norm: colour scale; that of the values if not given.
-        size: of the numbers [pt].
+    Colours are logarithmic for values of several magnitudes, if no scale is given.
     """
     norm = norm or colours(table)
     size = size or (8.0 if table.size <= 50 else 6.3)
@@ -189,7 +176,7 @@ def colours(values: np.ndarray) -> Normalize:
     if not len(finite):
         return Normalize(0, 1)
     low, high = float(finite.min()), float(finite.max())
-    if low > 0 and high > 10 * low:
+    if style.spans(values, 10):
         return LogNorm(low, high)
     return Normalize(low, high if high > low else low + 1)
 
@@ -201,11 +188,7 @@ def is_mismatch(axes: list[SweepAxis]) -> bool:
 
 
 def mismatch(data: xr.Dataset) -> Figure:
-    """Deviation and choke travel by working point of the model and operating region, a row of panels per controller.
-
-    Args:
-        data: finished scenarios with the columns ``reference`` and ``model.choke`` or ``model.lift``.
-    """
+    """Deviation and choke travel by working point of the model and operating region, a row of panels per controller."""
     parts = controller_parts(data)
     found = {axis.key: axis for axis in sweep_axes(data)}
     key = "model.choke" if "model.choke" in found else "model.lift"
@@ -217,7 +200,8 @@ def mismatch(data: xr.Dataset) -> Figure:
     drawn, grid = style.grid(len(parts), 2, 9.0, height + 1.5, sharex=True, sharey=True)
     y, x = (np.arange(count, dtype=float) for count in (steps * len(regions), len(points)))
     holes = bool(data.attrs.get("missing"))
-    for column, (title, quantity) in enumerate(zip(titles, (deviation, _travel), strict=True)):
+    travel = functools.partial(figure_of, name="choke_travel")
+    for column, (title, quantity) in enumerate(zip(titles, (deviation, travel), strict=True)):
         norm = colours(quantity(data).values)
         holes = holes or not np.isfinite(quantity(data).values).all()
         mesh: Any = None
@@ -249,7 +233,3 @@ def mismatch(data: xr.Dataset) -> Figure:
     ]
     sheet.write(drawn, data, [" ".join(filter(None, words))])
     return drawn
-
-
-def _travel(data: xr.Dataset) -> xr.DataArray:
-    return figure_of(data, "choke_travel")

@@ -20,6 +20,7 @@ from studies.definition.fields import as_text
 
 COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.ORANGE, style.PURPLE, style.SKY, style.GREY)
 MODES = {"moves": "o", "inputs": "s", "none": "^"}
+POINT = {"markersize": 7, "markeredgecolor": "white"}
 ROUND = ((1, 0.6), (1, -0.6), (-1, 0.6), (-1, -0.6), (0, 1), (0, -1), (1, 0), (-1, 0))
 SHIFTS = np.array([(r * dx, r * dy) for r in (7, 13, 20, 28, 38, 50, 65, 80) for dx, dy in ROUND])  # pt
 
@@ -117,18 +118,13 @@ def draw(data: xr.Dataset) -> Figure:
         if ax is third:
             ax.set_xlim(left=0)
             ax.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True))
-        elif _magnitudes(values):
+        elif style.spans(values, 10):
             ax.set_xscale("log")
         else:
             ax.xaxis.set_major_locator(MaxNLocator(nbins=4))  # numbers of four digits fit side by side
     first.set_ylabel(f"closed-loop cost above that of\n{reference} [%]")
-    grey: dict[str, Any] = {
-        "linestyle": "none",
-        "color": "#666666",
-        "markeredgecolor": "white",
-        "markersize": 7,
-    }
     modes = list(dict.fromkeys(variant.mode for variant in variants))
+    grey: dict[str, Any] = {"linestyle": "none", "color": "#666666", **POINT}
     handles = [Line2D([], [], marker=MODES.get(mode, "D"), **grey, label=mode) for mode in modes]
     if any(variant.thesis for variant in variants):
         look: dict[str, Any] = {**sheet.RING, "color": style.BLACK, "markersize": 10}
@@ -148,29 +144,16 @@ def draw(data: xr.Dataset) -> Figure:
     return drawn
 
 
-def _point(
-    ax: Axes, variant: Blocking, values: np.ndarray, lost: np.ndarray, colour: str
-) -> tuple[float, float]:
+def _point(ax: Axes, variant: Blocking, values, lost, colour: str) -> tuple[float, float]:
     """Median of a variant with its quartiles; where it is."""
     x, y = quartiles(values[variant.rows]), quartiles(lost[variant.rows])
-    look: dict[str, Any] = {
-        "markersize": 7,
-        "markeredgecolor": "white",
-        "markeredgewidth": 0.6,
-        "color": colour,
-    }
-    look |= {"marker": MODES.get(variant.mode, "D"), "elinewidth": 1.0, "ecolor": (colour, 0.4), "zorder": 3}
-    apart = [[[at[1] - at[0]], [at[2] - at[1]]] for at in (x, y)]
+    look: dict[str, Any] = {"marker": MODES.get(variant.mode, "D"), "color": colour, "markeredgewidth": 0.6}
+    look |= {"elinewidth": 1.0, "ecolor": (colour, 0.4), "zorder": 3, **POINT}
+    apart = [np.diff(at)[:, None] for at in (x, y)]
     ax.errorbar(x[1], y[1], xerr=apart[0], yerr=apart[1], **look)
     if variant.thesis and np.isfinite((x[1], y[1])).all():
         sheet.ring(ax, x[1], y[1], label=None, size=13)
     return x[1], y[1]
-
-
-def _magnitudes(values: np.ndarray) -> bool:
-    """Whether the values span more than one magnitude."""
-    values = values[np.isfinite(values)]
-    return len(values) > 0 and values.min() > 0 and values.max() > 10 * values.min()
 
 
 def place_labels(
@@ -178,11 +161,8 @@ def place_labels(
 ) -> None:
     """Write labels beside points, where they cover neither a point nor each other as far as there is room.
 
-    Args:
-        ax: laid out already.
-        names: text and colour of each label.
-        places: of the points, in data units.
-        size: of the text [pt].
+    `ax` is laid out already, `names` are text and colour of each label, `places` those of the points in data units, and
+    `size` is that of the text [pt].
     """
     canvas: Any = ax.figure.canvas
     pixel = ax.figure.dpi / 72
@@ -203,15 +183,12 @@ def place_labels(
         taken = np.vstack([taken, boxes[best]])
         line = {"arrowstyle": "-", "color": colour, "linewidth": 0.5, "shrinkA": 0, "shrinkB": 4}
         look |= {"va": "bottom", "zorder": 4, "path_effects": [withStroke(linewidth=2, foreground="white")]}
-        far = np.abs(SHIFTS[best]).max() > 14
-        ax.annotate(
-            text, places[i], (corners[best] - point) / pixel, arrowprops=line if far else None, **look
-        )
+        look["arrowprops"] = line if np.abs(SHIFTS[best]).max() > 14 else None
+        ax.annotate(text, places[i], (corners[best] - point) / pixel, **look)
 
 
 def _common(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Areas ``"one other"`` that boxes share."""
-    sides = np.minimum(one[:, None, 2:], other[None, :, 2:]) - np.maximum(
-        one[:, None, :2], other[None, :, :2]
-    )
+    one = one[:, None]
+    sides = np.minimum(one[..., 2:], other[:, 2:]) - np.maximum(one[..., :2], other[:, :2])
     return np.maximum(sides, 0.0).prod(axis=2)

@@ -49,14 +49,7 @@ def missing(data: xr.Dataset) -> str:
 
 
 def colour_bar(mappable: Any, axes: Any, label: str = "", **options) -> Colorbar:
-    """A colour bar beside one or more panels, with plain numbers on a logarithmic scale too.
-
-    Args:
-        mappable: what it explains.
-        axes: a panel, or an array of panels.
-        label: with the unit.
-        **options: for `matplotlib.figure.Figure.colorbar`.
-    """
+    """A colour bar beside a panel or an array of panels, with plain numbers on a logarithmic scale too."""
     drawn: Any = np.atleast_1d(axes)[0].figure
     bar = drawn.colorbar(mappable, ax=axes, label=label, **options)
     bar.outline.set_visible(False)
@@ -73,14 +66,12 @@ def ring(axes: Axes, x, y, label: str | None = "thesis tuning", size: float = 11
     axes.plot(x, y, **RING, markersize=size, markeredgecolor="white", markeredgewidth=3.2, zorder=5)
     axes.plot(x, y, **RING, markersize=size, markeredgecolor=style.BLACK, markeredgewidth=1.3, zorder=5.1)
     if label:
-        axes.annotate(
-            label,
-            (x[0], y[0]),
-            xytext=(9, 7),
-            textcoords="offset points",
-            fontsize=8.5,
-            weight="bold",
-            color=style.BLACK,
-            zorder=6,
-            bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.85},
-        )
+        box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
+        look: dict[str, Any] = {
+            "fontsize": 8.5,
+            "weight": "bold",
+            "color": style.BLACK,
+            "zorder": 6,
+            "bbox": box,
+        }
+        axes.annotate(label, (x[0], y[0]), xytext=(9, 7), textcoords="offset points", **look)

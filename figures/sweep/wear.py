@@ -15,8 +15,9 @@ from matplotlib.lines import Line2D
 
 from figures import style
 from figures.sweep import sheet
-from figures.sweep.data import SweepAxis, deviation, figure_of, load, sweep_axes, thesis_tuning
+from figures.sweep.data import SweepAxis, axis_of, deviation, figure_of, load, sweep_axes, thesis_tuning
 from jaxmpc.errors import InputError
+from studies.kpi.objectives import unbeaten
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "d")
 COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, *style.SPARE_COLOURS)
@@ -28,21 +29,13 @@ SPREAD = 30.0  # largest over smallest value of an axis that is drawn logarithmi
 def front(x, y) -> np.ndarray:
     """Which points no other point beats: as good in both and better in one, smaller being better.
 
-    Equal points do not beat each other. Points with NaN are never on the front and beat nothing.
+    Equal points do not beat each other. Points that are not finite are never on the front and beat nothing.
 
     Args:
         x: ``"point"``.
         y: ``"point"``.
     """
-    x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-    on = np.zeros(len(x), dtype=bool)
-    best_y, best_x = np.inf, np.nan
-    for i in np.lexsort((y, x)):  # by x, then by y; NaN last
-        if np.isnan(x[i]) or np.isnan(y[i]):
-            continue
-        if y[i] < best_y or (y[i] == best_y and x[i] == best_x):
-            on[i], best_y, best_x = True, y[i], x[i]
-    return on
+    return unbeaten(np.column_stack([x, y]).astype(float))
 
 
 @style.house_style
@@ -88,8 +81,7 @@ def pareto(
     if mark.any():
         sheet.ring(axes, across[mark], up[mark])
     for values, set_scale in ((across, axes.set_xscale), (up, axes.set_yscale)):
-        finite = values[np.isfinite(values)]
-        if len(finite) and finite.min() > 0 and finite.max() > SPREAD * finite.min():
+        if style.spans(values, SPREAD):
             set_scale("log")
     axes.set_xlabel(x_title)
     axes.set_ylabel(y_title)
@@ -153,8 +145,7 @@ def _pick(data: xr.Dataset, known: list[SweepAxis], key: str) -> SweepAxis:
             return axis
     if key not in data.coords or data[key].dims != ("scenario",):
         raise InputError("color or marker", key, f"a column of the study: {', '.join(a.key for a in known)}")
-    attrs = data[key].attrs
-    return SweepAxis(key, attrs.get("long_name", key), attrs.get("units", ""), data[key].values)
+    return axis_of(data, key)
 
 
 def _marker_axis(known: list[SweepAxis], coloured: SweepAxis | None) -> SweepAxis | None:
@@ -163,15 +154,12 @@ def _marker_axis(known: list[SweepAxis], coloured: SweepAxis | None) -> SweepAxi
     return min(rest, key=lambda a: (a.key != "controller", a.numeric), default=None)
 
 
-def _points(
-    axes: Axes, x: np.ndarray, y: np.ndarray, coloured: SweepAxis | None, shaped: SweepAxis | None
-) -> None:
+def _points(axes: Axes, x, y, coloured: SweepAxis | None, shaped: SweepAxis | None) -> None:
     small = len(x) > MANY
     look: dict[str, Any] = {"s": 14 if small else 34, "linewidth": 0.25 if small else 0.4}
     look |= {"edgecolor": "white", "zorder": 3}
     paints = np.full(len(x), style.BLUE, dtype=object)
-    handles: list[Line2D] = []
-    titles = []
+    handles, titles = [], []
     grey: dict[str, Any] = {"linestyle": "none", "markersize": 6, "markeredgecolor": "white"}
     if coloured is not None and coloured.numeric:
         paints = coloured.values.astype(float)

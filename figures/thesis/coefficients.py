@@ -14,12 +14,7 @@ WORKING_CHOKE = 50.0  # %, where the model is identified
 
 
 def draw(data: xr.Dataset, cv: str) -> Figure:
-    """Three curves, one per gas-lift rate: steady change of the rate per % of choke over the choke.
-
-    Args:
-        data: results of the thesis study, with `sweep_coefficient`.
-        cv: name of the CV.
-    """
+    """Three curves, one per gas-lift rate: steady change of the rate per % of choke over the choke."""
     curves = data.sweep_coefficient.sel(cv=cv)
     drawn, (axes,) = style.figure(1, row_height=3.6)
     for lift, mark, (colour, line) in zip(curves.sweep_lift.values, MARKERS, style.SERIES, strict=False):
@@ -52,9 +47,9 @@ ENTRIES = tuple(
         id,
         f"{style.name_of(cv)}: steady-state step coefficients over the choke",
         "thesis",
-        f"figure_{id}_{cv.removesuffix('_rate')}_coefficients",
         draw,
         _caption,
+        f"{cv.removesuffix('_rate')}_coefficients",
         arguments={"cv": cv},
     )
     for id, cv in (("10", OIL), ("11", GAS))

@@ -21,11 +21,7 @@ When = Callable[[xr.Dataset, str], float]
 
 
 def retuned_at(data: xr.Dataset, controller: str) -> float:
-    """When the tuning of a controller changes for the first time [s].
-
-    Raises:
-        InputError: if it never does.
-    """
+    """When the tuning of a controller changes for the first time [s]; an `InputError` if it never does."""
     for known in (provenance(data, "definition") or {}).get("controllers", ()):
         if known["name"] == controller and known.get("then"):
             return float(known["then"][0]["at"])
@@ -33,11 +29,7 @@ def retuned_at(data: xr.Dataset, controller: str) -> float:
 
 
 def disturbed_at(data: xr.Dataset, _controller: str = INTEGER) -> float:
-    """When the reservoir pressure first leaves its nominal value [s].
-
-    Raises:
-        InputError: if it never does.
-    """
+    """When the reservoir pressure first leaves its nominal value [s]; an `InputError` if it never does."""
     away = np.flatnonzero(data.disturbance.values != 0)
     if not len(away):
         raise InputError("results.disturbance", "0 bar throughout", "a run with a pressure offset")
@@ -45,13 +37,7 @@ def disturbed_at(data: xr.Dataset, _controller: str = INTEGER) -> float:
 
 
 def rates(data: xr.Dataset, controller: str, when: When) -> Figure:
-    """Oil rate above gas rate over time, with setpoints and deadzones; a dotted line marks the event.
-
-    Args:
-        data: results.
-        controller: name of a finished run.
-        when: finds the time of the event.
-    """
+    """Oil rate above gas rate over time, with setpoints and deadzones; a dotted line marks the event."""
     return _marked(runs.rates(data, controller), data, when(data, controller))
 
 
@@ -96,14 +82,13 @@ def _disturbed_caption(data: xr.Dataset, controller: str, when: When) -> str:
     after = between(data, when(data, controller))
     run = after.sel(controller=controller, cv=OIL)
     fall, end = float((run.setpoint - run.measurement).max()), settled(after, controller)
-    compromise = (
-        " More lift would bring the oil back and take the gas rate up: the weights settle in between."
-    )
-    return (
+    text = (
         f"The pressure drop takes the oil rate up to {fall:.1f} m³/h below its setpoint. It ends "
         f"{end[OIL]:+.1f} m³/h off, the gas rate {end[GAS]:+.0f} m³/h."
-        f"{compromise if abs(end[OIL]) > panels.soft_half_width(run) else ''}"
     )
+    if abs(end[OIL]) > panels.soft_half_width(run):
+        text += " More lift would bring the oil back and take the gas rate up: the weights settle in between."
+    return text
 
 
 def _inputs_caption(data: xr.Dataset, controller: str, when: When) -> str:
@@ -131,9 +116,9 @@ ENTRIES = (
             str(id),
             f"{what}: {words}",
             study,
-            f"figure_{id}_{function.__name__}_{study.replace('-', '_')}",
             function,
             caption,
+            f"{function.__name__}_{study.replace('-', '_')}",
             (INTEGER,),
             {"controller": INTEGER, "when": when},
         )
@@ -146,5 +131,5 @@ ENTRIES = (
             (first + 1, "choke and gas lift", inputs, _inputs_caption),
         )
     ),
-    FigureEntry("33", "the disturbance", "disturbance", "figure_33_pressure", pressure, _pressure_caption),
+    FigureEntry("33", "the disturbance", "disturbance", pressure, _pressure_caption, "pressure"),
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -18,14 +20,8 @@ PAIRS = {  # one model and schedule, in words
     "without": ("single-no-soft", "scheduled-no-soft"),
     "rounded": ("rounded", "rounded-scheduled"),
 }
-COLOURS = {
-    "single": style.GREEN,
-    "scheduled": style.BLUE,
-    "single-no-soft": style.PURPLE,
-    "scheduled-no-soft": style.ORANGE,
-    "rounded": style.VERMILLION,
-    "rounded-scheduled": style.SKY,
-}
+_COLOURS = (style.GREEN, style.BLUE, style.PURPLE, style.ORANGE, style.VERMILLION, style.SKY)
+COLOURS = dict(zip(itertools.chain(*PAIRS.values()), _COLOURS, strict=True))
 RATE_SHOWN, CHOKE_SHOWN = (55.0, 135.0), (0.0, 20.0)  # m3/h of oil, %
 
 
@@ -64,7 +60,7 @@ def draw(data: xr.Dataset) -> Figure:
 def _reversal_bars(axes: Axes, data: xr.Dataset) -> None:
     """Choke reversals in the second half of every window, one bar per controller."""
     figures = key_figures(data)
-    names = [name for pair in PAIRS.values() for name in pair if name in figures.controller.values]
+    names = [name for name in COLOURS if name in figures.controller.values]
     windows = figures.sizes["window"]
     width = 0.85 / len(names)
     for i, name in enumerate(names):
@@ -99,9 +95,8 @@ ENTRIES = (
         "gain-scheduling",
         "one model against a gain schedule, near closed",
         "gain-scheduling",
-        "gain_scheduling",
         draw,
         _caption,
-        tuple(COLOURS),
+        needs=tuple(COLOURS),
     ),
 )

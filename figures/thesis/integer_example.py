@@ -56,14 +56,8 @@ def valid_inequality(_results=None) -> Figure:
     drawn, axes = _plane()
     crossings = [point for known in EXAMPLE.rows if (point := example.crossing(row, known)) is not None]
     beyond = [p for p in (*example.corners(EXAMPLE), *crossings) if row.excess(p) >= 0 and EXAMPLE.holds(p)]
-    axes.fill(
-        *np.array(example.hull(beyond), dtype=float).T,
-        facecolor="none",
-        edgecolor=style.VERMILLION,
-        hatch="////",
-        linewidth=0,
-        label="cut off: no integer point",
-    )
+    look = {"facecolor": "none", "edgecolor": style.VERMILLION, "hatch": "////", "linewidth": 0}
+    axes.fill(*np.array(example.hull(beyond), dtype=float).T, **look, label="cut off: no integer point")
     axes.plot(*_line(row), color=style.VERMILLION, linewidth=1.8, label=f"valid inequality {row_text(row)}")
     return _finish(drawn, axes)
 
@@ -149,12 +143,10 @@ ENTRIES = (
         "3",
         "optimum of a relaxation far from that of the integer program",
         None,
-        "figure_3_relaxation",
         optima,
         _optima_caption,
+        "relaxation",
     ),
-    FigureEntry(
-        "4", "convex hull of the integer points", None, "figure_4_convex_hull", convex_hull, _hull_caption
-    ),
-    FigureEntry("5", "a valid inequality", None, "figure_5_valid_inequality", valid_inequality, _cut_caption),
+    FigureEntry("4", "convex hull of the integer points", None, convex_hull, _hull_caption, "convex_hull"),
+    FigureEntry("5", "a valid inequality", None, valid_inequality, _cut_caption, "valid_inequality"),
 )

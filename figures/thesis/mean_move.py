@@ -72,9 +72,8 @@ ENTRIES = (
         "mean-move",
         "the mean-move limit: reactive against predictive",
         "mean-move",
-        "mean_move",
         draw,
         _caption,
-        tuple(f"{kind}-{mode}" for kind in KINDS for mode in MODES),
+        needs=tuple(f"{kind}-{mode}" for kind in KINDS for mode in MODES),
     ),
 )

@@ -48,9 +48,9 @@ ENTRIES = tuple(
         id,
         f"{words}: open against closed loop",
         "predictions",
-        f"figure_{id}_{kind}_open_loop",
         compared,
         _caption,
+        f"{kind}_open_loop",
         (CLOSED, OPEN),
         {"channels": channels},
     )

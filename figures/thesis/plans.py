@@ -28,19 +28,15 @@ PREDICTED = "closed-loop"  # the controller of figures 25 to 28
 
 
 def planned(data: xr.Dataset, controller: str) -> Figure:
-    """Six plots over time: rates, inputs and their moves; past on white, a plan with its prediction on grey.
-
-    Args:
-        data: results of the study ``predictions``.
-        controller: name of a run whose plans are stored; its plan when the setpoints first change is drawn.
-    """
-    plan = first_plan(data, controller)
+    """Six plots over time: rates, inputs and their moves; past on white, a plan with its prediction on grey."""
+    plan = plan_at(data, controller, first_change(data))
     return _six_panels(data, controller, plan, known=plan.time)
 
 
 def evolved(data: xr.Dataset, controller: str) -> Figure:
     """Six plots over time: rates, inputs and their moves; what happened, and the first plan dashed."""
-    return _six_panels(data, controller, first_plan(data, controller), known=np.inf, grey=False, line="--")
+    plan = plan_at(data, controller, first_change(data))
+    return _six_panels(data, controller, plan, known=np.inf, grey=False, line="--")
 
 
 def _six_panels(data: xr.Dataset, controller: str, plan: StoredPlan, **options: Any) -> Figure:
@@ -55,10 +51,7 @@ def _six_panels(data: xr.Dataset, controller: str, plan: StoredPlan, **options: 
 def swing(data: xr.Dataset, controller: str, which: int) -> Figure:
     """Four plots over time: oil and gas rate with prediction and response, choke and lift with the plan.
 
-    Args:
-        data: results of the study ``without-soft``.
-        controller: name of a run that oscillates.
-        which: 0, 1 or 2: the first, second or third move.
+    `which` of the three moves of an oscillation: 0, 1 or 2.
     """
     moves = swing_moves(data, controller)
     plan = plan_at(data, controller, moves[which])
@@ -141,11 +134,6 @@ def first_change(data: xr.Dataset) -> float:
     return float(data.time.values[int(np.flatnonzero(data.window.values > 0)[0])])
 
 
-def first_plan(data: xr.Dataset, controller: str) -> StoredPlan:
-    """The plan made then."""
-    return plan_at(data, controller, first_change(data))
-
-
 def swing_moves(data: xr.Dataset, controller: str) -> tuple[float, float, float]:
     """Times [s] of three successive moves that turn the choke back, the quickest three of the busiest window.
 
@@ -167,7 +155,7 @@ def swing_moves(data: xr.Dataset, controller: str) -> tuple[float, float, float]
 
 
 def _planned_caption(data: xr.Dataset, controller: str) -> str:
-    plan = first_plan(data, controller)
+    plan = plan_at(data, controller, first_change(data))
     end = dict(zip(map(str, data.mv.values), plan.mv[-1], strict=True))
     off = _off_setpoint(data, plan, dict(zip(map(str, data.cv.values), plan.cv[-1], strict=True)))
     moving = np.flatnonzero(np.abs(plan.move[:, index_of(data.mv, CHOKE)]) > 0)
@@ -180,7 +168,7 @@ def _planned_caption(data: xr.Dataset, controller: str) -> str:
 
 
 def _evolved_caption(data: xr.Dataset, controller: str) -> str:
-    plan = first_plan(data, controller)
+    plan = plan_at(data, controller, first_change(data))
     end = int(np.searchsorted(data.time.values, plan.cv_time[-1], side="right")) - 1
     run = data.sel(controller=controller).isel(time=end)
     off = _off_setpoint(data, plan, {cv: run.measurement.sel(cv=cv).item() for cv in (GAS, OIL)})
@@ -217,34 +205,27 @@ def _swing_caption(data: xr.Dataset, controller: str, which: int) -> str:
 
 
 ENTRIES = (
-    FigureEntry(
-        "25",
-        "plan of the mixed-integer MPC at a step of the setpoints",
-        "predictions",
-        "figure_25_plan",
-        planned,
-        _planned_caption,
-        (PREDICTED,),
-        {"controller": PREDICTED},
-    ),
-    FigureEntry(
-        "26",
-        "evolution after that step",
-        "predictions",
-        "figure_26_evolution",
-        evolved,
-        _evolved_caption,
-        (PREDICTED,),
-        {"controller": PREDICTED},
+    *(
+        FigureEntry(id, title, "predictions", draw, caption, slug, (PREDICTED,), {"controller": PREDICTED})
+        for id, title, draw, caption, slug in (
+            (
+                "25",
+                "plan of the mixed-integer MPC at a step of the setpoints",
+                planned,
+                _planned_caption,
+                "plan",
+            ),
+            ("26", "evolution after that step", evolved, _evolved_caption, "evolution"),
+        )
     ),
     *(
         FigureEntry(
             str(36 + which),
             f"prediction and response at the {word} turn of an oscillation",
             "without-soft",
-            f"figure_{36 + which}_prediction_{which + 1}",
             swing,
             _swing_caption,
+            f"prediction_{which + 1}",
             ("no-soft",),
             {"controller": "no-soft", "which": which},
         )

@@ -30,11 +30,7 @@ SETTLED = 30  # samples at the end of a window whose mean is where the run has s
 
 @style.house_style
 def draw(data: xr.Dataset) -> Figure:
-    """The steady map with the end points of each demand; lift, choke and rates over time beside it.
-
-    Args:
-        data: results of `studies.thesis.rto`, both runs finished.
-    """
+    """The steady map with the end points of each demand; lift, choke and rates over time beside it."""
     ranges = provenance(data, "lift_ranges")
     drawn, spare = style.grid(4, 2, 11.0, 6.8, sharex="col", width_ratios=(1.0, 1.15))
     grid = spare[0, 0].get_gridspec()
@@ -96,14 +92,10 @@ def _map(axes: Axes, data: xr.Dataset, ranges: list[list[float]]) -> None:
     for (name, curve), mark, side in zip(CURVES.items(), "oD", (-1, 1), strict=True):
         run = data.position.sel(controller=name).values
         ends = np.array([run[window == w][-SETTLED:].mean(axis=0) for w in np.unique(window)])
-        look: dict[str, Any] = {
-            "markersize": 7,
-            "markeredgecolor": "white",
-            "color": curve["color"],
-            "zorder": 4,
-        }
-        axes.plot(*ends.T, mark, label=f"settled, {curve['label']}", **look)
-        note = {"fontsize": 8.5, "weight": "bold", "color": curve["color"], "va": "center", "zorder": 5}
+        colour, label = curve["color"], f"settled, {curve['label']}"
+        look: dict[str, Any] = {"markersize": 7, "markeredgecolor": "white", "zorder": 4}
+        axes.plot(*ends.T, mark, label=label, color=colour, **look)
+        note = {"fontsize": 8.5, "weight": "bold", "color": colour, "va": "center", "zorder": 5}
         note |= {"xytext": (7 * side, 5 * side), "ha": "left" if side > 0 else "right"}
         for k, place in enumerate(ends):
             axes.annotate(str(k + 1), place, textcoords="offset points", **note)

@@ -19,6 +19,7 @@ from studies.kpi import loop as kpi
 from studies.kpi.evaluate import NEAR_CLOSED
 
 SMOOTH, ROUNDED, INTEGER, HARD = "continuous-choke", "step-choke", "mixed-integer", "no-soft"
+COMPARED = ("soft", HARD, "no-soft-plain")  # controllers with and without Soft MPC
 LEAST = {CHOKE: 10.0, LIFT: 100.0}  # of an axis, so that a few steps of 2 % do not look like much
 SWINGS = 8  # reversals to show in a close-up
 MARGIN = 0.1  # of the stretch, before and after
@@ -29,10 +30,6 @@ def rates(data: xr.Dataset, controller: str) -> Figure:
     """Oil rate above gas rate over time: measured, the setpoint dashed, and the deadzone if there is one.
 
     Vertical limits hold every controller in `data`.
-
-    Args:
-        data: results, whole or a stretch of time or of controllers.
-        controller: name of a finished run.
     """
     drawn, axes, seconds = _stack(data, controller, data.sizes["cv"])
     for ax, cv in zip(axes, panels.cv_names(data), strict=True):
@@ -84,14 +81,7 @@ def _stack(data: xr.Dataset, controller: str, rows: int) -> tuple[Figure, list[A
 def oscillating_stretch(data: xr.Dataset, controller: str) -> tuple[float, float]:
     """Start and end [s] of a close-up: up to `SWINGS` reversals in the second half of a setpoint window.
 
-    The window is the one with most choke reversals below 50 % there.
-
-    Args:
-        data: results.
-        controller: name of the rounded controller.
-
-    Raises:
-        InputError: if the choke never reverses there.
+    The window is the one with most choke reversals below 50 % there; an `InputError` if the choke never reverses there.
     """
     late = kpi.second_halves(data.window.values)
     event, position = turns(data, controller, late)
@@ -169,60 +159,41 @@ def _close_up_inputs_caption(data: xr.Dataset, controller: str) -> str:
 
 
 def _without_soft_caption(data: xr.Dataset, controller: str) -> str:
-    count = {name: times(reversals(data, name)) for name in ("soft", controller, "no-soft-plain")}
+    soft, hard, plain = (times(reversals(data, name)) for name in COMPARED)
     return (
-        f"Without Soft MPC the choke reverses {count[controller]} over the run, with the extra penalty simply left out "
-        f"{count['no-soft-plain']}, with Soft MPC {count['soft']}."
+        f"Without Soft MPC the choke reverses {hard} over the run, with the extra penalty simply left out "
+        f"{plain}, with Soft MPC {soft}."
     )
 
 
 _RATES = ("rates", "oil and gas rate", rates, _rates_caption)
 _INPUTS = ("inputs", "choke and gas lift", inputs, _inputs_caption)
 _BIAS = ("bias", "output bias", bias, _bias_caption)
+_WHOLE = (_RATES, _INPUTS, _BIAS)
+_CLOSE_UPS = (
+    (*_RATES[:2], close_up_rates, _close_up_rates_caption),
+    (*_INPUTS[:2], close_up_inputs, _close_up_inputs_caption),
+)
+_HARD = ((*_RATES[:3], _without_soft_caption), _INPUTS)
+_GROUPS = (  # of successive figures: controller, number of the first, what it shows, study, files, and what they are
+    (SMOOTH, 14, ": continuous MPC, continuous choke", "thesis", "continuous_choke", _WHOLE),
+    (ROUNDED, 17, ": continuous MPC, step choke", "thesis", "step_choke", _WHOLE),
+    (ROUNDED, 20, " while the rounded controller oscillates", "thesis", "oscillating", _CLOSE_UPS),
+    (INTEGER, 22, ": mixed-integer MPC", "thesis", "mixed_integer", _WHOLE),
+    (HARD, 34, ": mixed-integer MPC without Soft MPC", "without-soft", "without_soft", _HARD),
+)
 
-
-def _entries(
-    controller: str, first: int, what: str, study: str, file: str, *kinds, needs: tuple[str, ...] = ()
-):
-    """Successive figures of one controller; `kinds` are name, words, function and caption of each."""
-    return [
-        FigureEntry(
-            str(first + i),
-            f"{words}{what}",
-            study,
-            f"figure_{first + i}_{kind}_{file}",
-            function,
-            caption,
-            needs if needs and i == 0 else (controller,),
-            {"controller": controller},
-        )
-        for i, (kind, words, function, caption) in enumerate(kinds)
-    ]
-
-
-ENTRIES = (
-    *_entries(
-        SMOOTH, 14, ": continuous MPC, continuous choke", "thesis", "continuous_choke", _RATES, _INPUTS, _BIAS
-    ),
-    *_entries(ROUNDED, 17, ": continuous MPC, step choke", "thesis", "step_choke", _RATES, _INPUTS, _BIAS),
-    *_entries(
-        ROUNDED,
-        20,
-        " while the rounded controller oscillates",
-        "thesis",
-        "oscillating",
-        (*_RATES[:2], close_up_rates, _close_up_rates_caption),
-        (*_INPUTS[:2], close_up_inputs, _close_up_inputs_caption),
-    ),
-    *_entries(INTEGER, 22, ": mixed-integer MPC", "thesis", "mixed_integer", _RATES, _INPUTS, _BIAS),
-    *_entries(
-        HARD,
-        34,
-        ": mixed-integer MPC without Soft MPC",
-        "without-soft",
-        "without_soft",
-        (*_RATES[:3], _without_soft_caption),
-        _INPUTS,
-        needs=("soft", HARD, "no-soft-plain"),
-    ),
+ENTRIES = tuple(
+    FigureEntry(
+        str(first + i),
+        f"{words}{what}",
+        study,
+        function,
+        caption,
+        f"{kind}_{file}",
+        COMPARED if caption is _without_soft_caption else (controller,),
+        {"controller": controller},
+    )
+    for controller, first, what, study, file, kinds in _GROUPS
+    for i, (kind, words, function, caption) in enumerate(kinds)
 )

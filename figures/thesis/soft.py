@@ -87,17 +87,12 @@ ENTRIES = (
         "12",
         "nominal and Soft mixed-integer MPC",
         "soft",
-        "figure_12_nominal_and_soft",
         compared,
         _compared_caption,
+        "nominal_and_soft",
         (NOMINAL, SOFT),
     ),
     FigureEntry(
-        "13",
-        "penalty of a deviation: Soft MPC and nominal",
-        None,
-        "figure_13_penalties",
-        penalties,
-        _penalties_caption,
+        "13", "penalty of a deviation: Soft MPC and nominal", None, penalties, _penalties_caption, "penalties"
     ),
 )

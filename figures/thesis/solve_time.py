@@ -26,29 +26,22 @@ MODES = ("moves", "inputs")
 
 
 def draw(data: xr.Dataset, controllers: tuple[str, ...]) -> Figure:
-    """Scatter plots over time on a logarithmic axis, one per controller: milliseconds of each step.
+    """Scatter plots over time on a logarithmic axis, one per controller: milliseconds of each step."""
+    return time_per_sample(_timed(data, controllers))
 
-    Args:
-        data: results of the thesis study.
-        controllers: names of finished runs of different kinds.
-    """
+
+def _timed(data: xr.Dataset, controllers: Iterable[str]) -> list[tuple[str, str, np.ndarray]]:
+    """Kind, blocking mode and times ``"sample"`` [ms] of finished runs."""
     runs = [data.sel(controller=name) for name in controllers]
-    return time_per_sample(
-        [
-            (str(run.kind.item()), str(run.blocking.item()), MILLISECONDS * run.solve_time.values)
-            for run in runs
-        ]
-    )
+    return [(run.kind.item(), run.blocking.item(), MILLISECONDS * run.solve_time.values) for run in runs]
 
 
 def _caption(data: xr.Dataset, controllers: tuple[str, ...]) -> str:
-    parts = []
-    for name in controllers:
-        ms = MILLISECONDS * data.solve_time.sel(controller=name).values
-        kind = str(data.kind.sel(controller=name).item())
-        parts.append(f"{kind} MPC {np.median(ms):.1f} / {ms.max():.0f} ms")
+    parts = ", ".join(
+        f"{kind} MPC {np.median(ms):.1f} / {ms.max():.0f} ms" for kind, _, ms in _timed(data, controllers)
+    )
     return (
-        f"Median and longest time of one step: {', '.join(parts)}; the sampling interval is "
+        f"Median and longest time of one step: {parts}; the sampling interval is "
         f"{float(data.attrs['dt']):.0f} s.{time_note(data, controllers)}"
     )
 
@@ -75,12 +68,15 @@ def draw_benchmark(results: str | Path | dict[str, Any], out: str | Path) -> lis
     Raises:
         InputError: for a file that cannot be read.
     """
-    body = results if isinstance(results, dict) else _load(Path(results))
+    try:
+        body: dict = results if isinstance(results, dict) else json.loads(Path(results).read_text())
+    except (OSError, ValueError, RecursionError) as error:
+        expected = f"a file of `jaxmpc bench --json` ({error})"
+        raise InputError("benchmark results", str(results), expected) from None
     series = body.get("series", {})
     paths: list[Path] = []
-    runs = [
-        (*name.split()[1:], np.array(s["solve_ms"])) for name, s in series.items() if name.startswith("run ")
-    ]
+    named = ((name.split(), found) for name, found in series.items())
+    runs = [(*words[1:], np.array(found["solve_ms"])) for words, found in named if words[0] == "run"]
     if runs:
         paths += style.save(time_per_sample(runs), out, RUN_NAME)
     if any(name.startswith("batch ") for name in series):
@@ -88,21 +84,8 @@ def draw_benchmark(results: str | Path | dict[str, Any], out: str | Path) -> lis
     return paths
 
 
-def _load(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(
-            "benchmark results", str(path), f"a file of `jaxmpc bench --json` ({error})"
-        ) from None
-
-
 def time_per_sample(runs: list[tuple[str, str, np.ndarray]]) -> Figure:
-    """One panel per run: solve time of every sample, its median, and the value that 99 % stay below.
-
-    Args:
-        runs: kind of the controller, blocking mode, and the times ``"sample"`` [ms].
-    """
+    """One panel per run of `_timed`: solve time of every sample, its median, and the value that 99 % stay below."""
     drawn, axes = style.figure(len(runs), row_height=1.9, sharey=True)
     for ax, (kind, mode, milliseconds) in zip(axes, runs, strict=True):
         hours = np.arange(len(milliseconds)) * DT_HOURS
@@ -128,8 +111,7 @@ def two_digits(value: float) -> str:
 def rate_over_batch(series: dict[str, Any]) -> Figure:
     """Relaxed QPs per second over batch size, with and without a start, and the rate of the peer beside it.
 
-    Args:
-        series: of the results; ``batch MODE`` has ``batch``, ``warm``, ``cold`` and perhaps a peer's rate.
+    Of the series, ``batch MODE`` has ``batch``, ``warm``, ``cold`` and perhaps a peer's rate.
     """
     modes = [mode for mode in MODES if f"batch {mode}" in series]
     drawn, axes = style.figure(len(modes), width=6.0, row_height=2.6, sharey=True)
@@ -161,9 +143,9 @@ ENTRIES = (
         "39",
         "computation time of every sample: continuous and mixed-integer MPC",
         "thesis",
-        "figure_39_solve_time",
         draw,
         _caption,
+        "solve_time",
         TIMED,
         {"controllers": TIMED},
     ),

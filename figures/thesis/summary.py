@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from figures import panels, style
 from figures.figure import FigureEntry
+from figures.thesis.runs import INTEGER, ROUNDED, SMOOTH
 from studies.kpi.evaluate import key_figures
 from studies.thesis.claims import claims
 from studies.thesis.report import summary_table
@@ -75,13 +76,8 @@ def _claims(page: Axes, said, top: float) -> None:
         middle = y - height / 2
         for x, lines in zip(places, cells, strict=False):
             page.text(x, middle, "\n".join(lines), fontsize=7.4, va="center", linespacing=1.15)
-        look = {
-            "fontsize": 8.3,
-            "weight": "bold",
-            "color": style.VERDICT_COLOURS[claim.verdict],
-            "va": "center",
-        }
-        page.text(places[-1], middle, claim.verdict, **look)
+        colour = style.VERDICT_COLOURS[claim.verdict]
+        page.text(places[-1], middle, claim.verdict, fontsize=8.3, weight="bold", color=colour, va="center")
         y -= height
         page.plot([LEFT, RIGHT], [y, y], color="#DDDDDD", linewidth=0.5)
 
@@ -94,13 +90,5 @@ def _caption(data: xr.Dataset) -> str:
 
 
 ENTRIES = (
-    FigureEntry(
-        "summary",
-        "one-page summary",
-        "thesis",
-        "summary",
-        draw,
-        _caption,
-        ("continuous-choke", "step-choke", "mixed-integer"),
-    ),
+    FigureEntry("summary", "one-page summary", "thesis", draw, _caption, needs=(SMOOTH, ROUNDED, INTEGER)),
 )

@@ -19,36 +19,28 @@ from studies.kpi.evaluate import key_figures
 def draw(data: xr.Dataset) -> Figure:
     """Three plots over the time limit: proven gaps of limited steps, choke travel, mean deviation of the oil rate."""
     figures = key_figures(data)
-    names = [str(name) for name in figures.controller.values]
-    limited = sorted((name for name in names if name != "exact"), key=_milliseconds)
-    order = [*limited, *(name for name in names if name == "exact")]
+    order = sorted(map(str, figures.controller.values), key=_milliseconds)
     figures = figures.sel(controller=order)
-    drawn, axes = style.grid(1, 3, 9.6, 3.4)
-    _gap_strips(axes[0, 0], data, limited)
+    drawn, ((gaps, travel, deviation),) = style.grid(1, 3, 9.6, 3.4)
+    _gap_strips(gaps, data, [name for name in order if name != "exact"])
+    away = figures.mean_absolute_deviation.sel(cv=OIL)
+    ticks = ["none" if name == "exact" else f"{_milliseconds(name):g} ms" for name in order]
     for ax, values, form, colour, label in (
-        (axes[0, 1], figures.choke_travel, ".0f", style.GREEN, "choke travel [%]"),
-        (
-            axes[0, 2],
-            figures.mean_absolute_deviation.sel(cv=OIL),
-            ".2f",
-            style.BLUE,
-            "mean absolute deviation, oil [m³/h]",
-        ),
+        (travel, figures.choke_travel, "{:.0f}", style.GREEN, "choke travel [%]"),
+        (deviation, away, "{:.2f}", style.BLUE, "mean absolute deviation, oil [m³/h]"),
     ):
         bars = ax.bar(np.arange(len(order)), values.values, 0.6, color=colour)
-        ax.bar_label(bars, fmt=f"{{:{form}}}", fontsize=8)
+        ax.bar_label(bars, fmt=form, fontsize=8)
         ax.set_ylabel(label)
-        ax.set_xticks(
-            np.arange(len(order)), ["none" if n == "exact" else f"{_milliseconds(n):g} ms" for n in order]
-        )
+        ax.set_xticks(np.arange(len(order)), ticks)
         ax.set_xlabel("time limit of a step")
         ax.grid(axis="x", visible=False)
     return drawn
 
 
 def _milliseconds(name: str) -> float:
-    """The limit in the name of a controller."""
-    return float(name.removeprefix("limit-").removesuffix("-ms"))
+    """The limit in the name of a controller, infinite for the exact one."""
+    return np.inf if name == "exact" else float(name.removeprefix("limit-").removesuffix("-ms"))
 
 
 def _gap_strips(axes: Axes, data: xr.Dataset, names: Sequence[str]) -> None:
@@ -76,10 +68,9 @@ ENTRIES = (
         "time-limit",
         "what limited solve times cost",
         "time-limit",
-        "time_limit",
         draw,
         "A step that ends at its limit applies the best plan found so far. The gaps are what the search could prove by "
         "then, not what the plan lost.",
-        ("exact",),
+        needs=("exact",),
     ),
 )

@@ -15,7 +15,7 @@ import os
 import sys
 
 from jaxmpc.cli import bench, explore, figures, identify, plan, study
-from jaxmpc.cli.options import EXIT_BAD_INPUT, EXIT_OTHER, complain, parser
+from jaxmpc.cli.options import EXIT_BAD_INPUT, EXIT_OTHER, Command, complain, parser
 from jaxmpc.errors import InputError, MissingToolError, PlantError
 from jaxmpc.programs import interrupts
 
@@ -60,10 +60,8 @@ def _fail(error: OSError) -> int:
         with contextlib.suppress(OSError, ValueError):
             sys.stdout.flush()
             return complain(error.strerror or error, EXIT_OTHER)
-        name = (
-            "standard output"  # what is left in it is dropped: the interpreter would try again and complain
-        )
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+        name = "standard output"
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115  (the interpreter would try the rest again and complain)
     return complain(f"{os.fsdecode(name)}: {error.strerror or error}", EXIT_OTHER)
 
 
@@ -98,18 +96,9 @@ def _check_platform() -> None:
 
 COMMANDS = {
     command.words: command
-    for command in (
-        *(
-            plan.plan,
-            identify.build,
-            identify.identify,
-            study.run,
-            study.status,
-            study.export,
-            study.simulate,
-        ),
-        *(figures.draw, explore.explore, bench.bench),
-    )
+    for part in (plan, identify, study, figures, explore, bench)
+    for command in vars(part).values()
+    if isinstance(command, Command)
 }
 
 

@@ -44,19 +44,15 @@ def command(words: str, *arguments: Argument, epilog: str = "") -> Callable[[Run
 
 
 def option(name: str, shown: Any, help: str, default: Any, **more: Any) -> Argument:
-    """An option (with dashes) or argument that has a value.
+    """An option (with dashes) or argument that has a value; `shown` stands for it in the help.
 
-    Args:
-        name: of it.
-        shown: what stands for the value in the help.
-        help: what it is, with its unit.
-        default: gives the type too; a type alone means None unless it is given.
-        **more: for `argparse`.
+    The default gives the type too; a type alone means None unless it is given. `more` is for `argparse`.
     """
+    settings = {"metavar": shown, "help": help} | more
     if isinstance(default, type):
-        return name, {"metavar": shown, "type": default, "help": help} | more
+        return name, settings | {"type": default}
     kind = type(default[0] if isinstance(default, tuple) else default)
-    return name, {"metavar": shown, "type": kind, "default": default, "help": help} | more
+    return name, settings | {"type": kind, "default": default}
 
 
 def choice(name: str, choices: tuple[Any, ...], help: str, **more: Any) -> Argument:
@@ -90,13 +86,8 @@ def parser(commands: Mapping[str, Command]) -> argparse.ArgumentParser:
             made = groups[""].add_parser(family, help=text, description=text, **plain)
             groups[family] = made.add_subparsers(**titles)
         text = " ".join((command.run.__doc__ or "").partition("\n\n")[0].split())
-        shown: dict[str, Any] = {
-            "help": text,
-            "description": text,
-            "epilog": command.epilog,
-            "formatter_class": _Help,
-        }
-        made = groups[family].add_parser(name, **shown, **plain)
+        shown: dict[str, Any] = {"help": text, "description": text, "epilog": command.epilog}
+        made = groups[family].add_parser(name, **shown, formatter_class=_Help, **plain)
         single = {}  # options that exclude each other, by what they set
         for argument, settings in command.arguments:
             if dest := settings.get("dest"):

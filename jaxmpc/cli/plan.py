@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -30,20 +31,8 @@ def plan(options: Options) -> int:
     case = load_case(options.case)
     from jaxmpc.controller.plan import solve_plan
 
-    solved = solve_plan(
-        case.model,
-        case.structure,
-        case.tuning,
-        mv_now=case.mv_now,
-        last_move=case.last_move,
-        free_response=case.free_response,
-        setpoint=case.setpoint,
-        previous_moves=case.previous_moves,
-        time_limit=case.time_limit,
-        gap=case.gap,
-        finish=options.finish,
-    )
-    body = plan_to_dict(solved)
+    given = {field.name: getattr(case, field.name) for field in dataclasses.fields(case)}
+    body = plan_to_dict(solve_plan(**given, finish=options.finish))
     fields = (f" {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in body.items())
     text = "{\n" + ",\n".join(fields) + "\n}\n"  # one field per line
     status, objective = body["status"], body["objective"]
@@ -53,7 +42,6 @@ def plan(options: Options) -> int:
         write_atomically(options.out, text)
         said = f"jaxmpc: {status}, objective {objective}, gap {body['gap']}: {options.out}"
         print(said, file=sys.stderr)
-    if status == "limit" and objective is None:
-        return cli.EXIT_OTHER  # the limit came before any feasible plan
-    known = {"optimal": cli.EXIT_OPTIMAL, "infeasible": cli.EXIT_INFEASIBLE, "limit": cli.EXIT_LIMIT}
+    limit = cli.EXIT_OTHER if objective is None else cli.EXIT_LIMIT  # None: it came before any feasible plan
+    known = {"optimal": cli.EXIT_OPTIMAL, "infeasible": cli.EXIT_INFEASIBLE, "limit": limit}
     return known.get(status, cli.EXIT_OTHER)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Bool
 
-from jaxmpc.controller.core import Core, may_switch
+from jaxmpc.controller.core import Core, may_switch, without
 from jaxmpc.errors import InputError
 from jaxmpc.integer.tables import INTEGERS, Constants, Tables
 from jaxmpc.model.step_response import StepResponseModel
@@ -33,12 +34,11 @@ _condense = jax.jit(condense, static_argnames=("size", "envelope", "has_limits")
 def _condense_some(layouts: Lanes[Layout], size, tunings, matrices: Lanes[Matrices], envelope, has_limits):
     """Problems of `AT_ONCE` lanes, without their responses."""
 
-    def lane(own_layout, tuning, own_matrices):
-        layout = eqx.combine(own_layout, layouts.shared)
-        given = eqx.combine(own_matrices, matrices.shared)
+    def lane(layout, tuning, own):
+        given = eqx.combine(own, matrices.shared)
         return _bare(condense(layout, size, tuning, given, envelope=envelope, has_limits=has_limits))
 
-    return jax.vmap(lane)(layouts.each, tunings, matrices.each)
+    return layouts.vmap(lane, tunings, matrices.each)
 
 
 def _bare(qp: CondensedQp) -> CondensedQp:
@@ -53,26 +53,33 @@ class _Own(NamedTuple):
     model: bool
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
 class Scenarios:
-    """What controllers are made of, checked: structures of one size, tunings and models, one for all or one per scenario.
+    """What controllers are made of, checked, one entry per scenario, and what their programs are compiled for."""
 
-    Args:
-        structures: with CVs and MVs of the same names.
-        tunings: weights and limits.
-        models: step-response models.
-        count: number of scenarios where it does not follow.
+    structures: list[Structure]  # with CVs and MVs of the same names
+    tunings: list[Tuning]  # weights and limits
+    models: list[StepResponseModel]  # step-response models
+    # what has lanes; it follows from what was given, not from its values: programs of the same form are the same
+    own: _Own
+    size: Size  # that holds all structures
+    integers: int  # whole moves that the tables of the search have room for
+    has_limits: bool  # whether any CV limit costs anything
+    switching: bool  # whether any CV may be switched off
 
-    Raises:
-        InputError: naming what does not fit.
-    """
-
-    def __init__(
-        self,
+    @classmethod
+    def checked(
+        cls,
         structures: Sequence[Structure],
         tunings: Sequence[Tuning],
         models: Sequence[StepResponseModel],
         count: int | None = None,
-    ):
+    ) -> Scenarios:
+        """Of structures, tunings and models, each one for all or one per scenario.
+
+        Raises:
+            InputError: naming what does not fit.
+        """
         given = {"structure": len(structures), "tunings": len(tunings), "models": len(models)}
         for name, number in given.items():
             if not number:
@@ -82,30 +89,29 @@ class Scenarios:
             raise InputError("tunings", given, "one for all or one per scenario")
         first = structures[0]
         for k, structure in enumerate(structures):
-            same = all(
-                getattr(first, key) == getattr(structure, key) for key in ("cv_names", "mv_names", "dt")
-            )
-            if not same:
-                found = f"{structure.mv_names} -> {structure.cv_names}, dt = {structure.dt} s"
-                raise InputError(
-                    f"structure[{k}]",
-                    found,
-                    f"{first.mv_names} -> {first.cv_names}, dt = {first.dt} s as the first",
-                )
+            names = lambda s: f"{s.mv_names} -> {s.cv_names}, dt = {s.dt} s"  # noqa: E731
+            if names(structure) != names(first):
+                raise InputError(f"structure[{k}]", names(structure), f"{names(first)} as the first")
             check_size(structure)
         for k, model in enumerate(models):
             check_match(first, model, f"model[{k}]" if len(models) > 1 else "model")
-        self.count = counts.pop() if counts else 1
-        # what has lanes follows from what was given, not from its values: programs of the same form are the same
-        self.own = _Own(*(len(given) > 1 for given in (structures, tunings, models)))
-        one_each = lambda values: list(values) * self.count if len(values) == 1 else list(values)  # noqa: E731
-        self.structures, self.tunings, self.models = map(one_each, (structures, tunings, models))
+        number = counts.pop() if counts else 1
+        one_each = lambda values: list(values) * number if len(values) == 1 else list(values)  # noqa: E731
         pairs = {(s, m.samples) for s in set(structures) for m in models}
-        self.size = functools.reduce(lambda a, b: a | b, (Size.of(*pair) for pair in pairs))
         most = max(len(s.integer_mvs) * s.block_count for s in structures)
-        self.integers = min(rung(most, INTEGERS), INTEGERS[-1]) if most else 0
-        self.has_limits = any(_limited(tuning) for tuning in tunings)
-        self.switching = any(may_switch(tuning) for tuning in tunings)
+        return cls(
+            *map(one_each, (structures, tunings, models)),
+            own=_Own(*(len(values) > 1 for values in (structures, tunings, models))),
+            size=functools.reduce(lambda a, b: a | b, (Size.of(*pair) for pair in pairs)),
+            integers=min(rung(most, INTEGERS), INTEGERS[-1]) if most else 0,
+            has_limits=any(_limited(tuning) for tuning in tunings),
+            switching=any(may_switch(tuning) for tuning in tunings),
+        )
+
+    @property
+    def count(self) -> int:
+        """Number of scenarios."""
+        return len(self.structures)
 
     @property
     def structure(self) -> Structure:
@@ -183,30 +189,21 @@ class Scenarios:
 
     def part(self, index: np.ndarray) -> Scenarios:
         """Some of the scenarios, in arrays of the same size."""
-        return self._like(
-            [[values[i] for i in index] for values in (self.structures, self.tunings, self.models)]
-        )
+        some = {key: [getattr(self, key)[i] for i in index] for key in ("structures", "tunings", "models")}
+        return dataclasses.replace(self, **some)
 
-    def with_tunings(self, tunings: list[Tuning]) -> Scenarios:
-        """The same scenarios with other tunings, in programs of the same form."""
-        some = self._like([self.structures, tunings, self.models])
-        some.own = self.own._replace(tuning=self.lanes)
-        return some
-
-    def _like(self, parts: list[list]) -> Scenarios:
-        some = object.__new__(Scenarios)
-        some.structures, some.tunings, some.models = parts
-        some.count, some.own = len(parts[0]), self.own
-        some.size, some.integers = self.size, self.integers
-        some.has_limits, some.switching = self.has_limits, self.switching
-        return some
+    def without(self, off: Bool[np.ndarray, "scenario cv"]) -> Scenarios:
+        """The same scenarios without the CVs that are switched off, in programs of the same form."""
+        pairs = [(id(t), own.tobytes()) for t, own in zip(self.tunings, off, strict=True)]
+        made = {key: without(t, own) for key, t, own in zip(pairs, self.tunings, off, strict=True)}
+        own = self.own._replace(tuning=self.lanes)
+        return dataclasses.replace(self, tunings=[made[key] for key in pairs], own=own)
 
 
 def _no_tables(qps: Lanes[CondensedQp]) -> Lanes[Tables]:
     """For problems without integer moves; traced where these are."""
     shared = qps.each.curvature is None
-    curvature = qps.shared.curvature if shared else qps.each.curvature
-    scale = jnp.maximum(jnp.max(jnp.diagonal(curvature, axis1=-2, axis2=-1), axis=-1), 1e-12)
+    scale = qps.value.unit
     one, square, levels = np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))
     whole, flag = one.astype(int), one.astype(bool)
     zero, yes = np.asarray(0), np.asarray(True)

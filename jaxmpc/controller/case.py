@@ -37,31 +37,20 @@ LONGEST_HORIZON = 100_000  # samples; beyond it the file is wrong, and memory ru
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Case:
-    """One controller step, checked.
+    """One controller step, checked."""
 
-    Attributes:
-        model: step responses.
-        structure: horizons, blocks and integer steps; its names and dt are the model's.
-        tuning: weights and limits.
-        mv_now: ``"mv"``, MVs before the move that is to be decided [MV unit].
-        last_move: ``"mv"``, the move that was applied at the previous sample [MV unit].
-        free_response: ``"horizon cv"``, what the CVs do without further moves, bias included [CV unit].
-        setpoint: ``"horizon cv"`` [CV unit].
-        previous_moves: ``"block mv"``, where the search may start [MV unit per sample], or ``None``.
-        time_limit: of the solve [s], or ``None``.
-        gap: relative gap at which the plan counts as optimal.
-    """
-
-    model: StepResponseModel
-    structure: Structure
-    tuning: Tuning
-    mv_now: np.ndarray
-    last_move: np.ndarray
+    model: StepResponseModel  # step responses
+    structure: Structure  # horizons, blocks and integer steps; its names and dt are the model's
+    tuning: Tuning  # weights and limits
+    mv_now: np.ndarray  # ``"mv"``, MVs before the move that is to be decided [MV unit]
+    last_move: np.ndarray  # ``"mv"``, the move that was applied at the previous sample [MV unit]
+    # ``"horizon cv"``, what the CVs do without further moves, bias included [CV unit]
     free_response: np.ndarray
-    setpoint: np.ndarray
+    setpoint: np.ndarray  # ``"horizon cv"`` [CV unit]
+    # ``"block mv"``, where the search may start [MV unit per sample], or ``None``
     previous_moves: np.ndarray | None = None
-    time_limit: float | None = None
-    gap: float = DEFAULT_GAP
+    time_limit: float | None = None  # of the solve [s], or ``None``
+    gap: float = DEFAULT_GAP  # relative gap at which the plan counts as optimal
 
 
 class _ModelFields(msgspec.Struct, forbid_unknown_fields=True):
@@ -136,9 +125,6 @@ _UNIT = {
 def load_case(path: str | Path) -> Case:
     """Read a case file.
 
-    Args:
-        path: JSON file with the fields of `Case`.
-
     Raises:
         InputError: for a file that cannot be read, text that is not JSON, and everything `make_case` refuses.
     """
@@ -162,9 +148,6 @@ def load_case(path: str | Path) -> Case:
 def make_case(body: Any) -> Case:
     """Check a decoded case file.
 
-    Args:
-        body: nested dictionaries and lists, as JSON decodes them.
-
     Returns:
         The case, with infinite limits where the file has null.
 
@@ -181,11 +164,11 @@ def make_case(body: Any) -> Case:
         model=model,
         structure=structure,
         tuning=make_tuning(structure, **{key: getattr(fields.tuning, key) for key in _IN_STEP}),
-        **{key: _array(key, getattr(fields, key), structure) for key in _ARRAYS},
+        **{key: step_array(key, getattr(fields, key), structure) for key in _ARRAYS},
         time_limit=check_time_limit("limits.time_s", limits.time_s),
         gap=check_gap("limits.gap", limits.gap),
     )
-    _check_position(case)
+    check_position(structure, case.tuning, case.mv_now)
     return case
 
 
@@ -281,10 +264,11 @@ def _structure(fields: _StructureFields, model: StepResponseModel) -> Structure:
     )
 
 
-def _array(path: str, given: list[Any] | None, structure: Structure) -> Any:
+def step_array(path: str, given: Any, structure: Structure) -> Any:
     """A finite vector with one entry per name, or a matrix of such rows, as many as it must have; None as it is."""
     if given is None:
         return None
+    given = np.asarray(given) if hasattr(given, "shape") else given
     _, columns, count, why = _ARRAYS[path]
     names = getattr(structure, columns)
     numbers = f"{len(names)} numbers{_unit(path)}"
@@ -292,7 +276,7 @@ def _array(path: str, given: list[Any] | None, structure: Structure) -> Any:
         expected = f"{why} = {getattr(structure, count)} rows of {numbers}"
         raise InputError(path, f"{len(given)} rows", expected)
     for i, row in enumerate(given if count else [given]):
-        if len(row) != len(names):
+        if np.size(row) != len(names):
             raise InputError(f"{path}[{i}]" if count else path, row, f"{numbers} for {', '.join(names)}")
     array = np.array(given, dtype=np.float64)
     bad = np.argwhere(~sound(array))
@@ -304,12 +288,12 @@ def _array(path: str, given: list[Any] | None, structure: Structure) -> Any:
     return array
 
 
-def _check_position(case: Case) -> None:
+def check_position(structure: Structure, tuning: Tuning, mv_now: np.ndarray) -> None:
     """Refuse MVs outside their limits: the closed-loop controller recovers, a single step cannot."""
-    low, high = np.asarray(case.tuning.mv_low), np.asarray(case.tuning.mv_high)
-    for i, name in enumerate(case.structure.mv_names):
-        now = float(case.mv_now[i])
-        drift = DRIFT * (case.structure.integer_step[i] or max(1.0, abs(now)))  # what MIP solvers leave over
+    low, high = np.asarray(tuning.mv_low), np.asarray(tuning.mv_high)
+    for i, name in enumerate(structure.mv_names):
+        now = float(mv_now[i])
+        drift = DRIFT * (structure.integer_step[i] or max(1.0, abs(now)))  # what MIP solvers leave over
         if not low[i] - drift <= now <= high[i] + drift:
             expected = f"mv_low[{i}] = {low[i]:g} to mv_high[{i}] = {high[i]:g} [MV unit] for {name}"
             raise InputError(f"mv_now[{i}]", now, expected)

@@ -15,12 +15,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmpc.check import check_keys
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.core import ControllerState
 from jaxmpc.controller.schedule import ModelSchedule, ScheduledController
 from jaxmpc.controller.targets import TargetController
 from jaxmpc.errors import InputError
-from jaxmpc.files import from_strict_json, strict_json, write_atomically
+from jaxmpc.files import from_strict_json, read_json, strict_json, write_atomically
 from jaxmpc.model.step_response import StepResponseModel, make_model
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import CV_FIELDS, Tuning, make_tuning
@@ -49,9 +50,6 @@ def save_controller(
         controller: a single one, of any kind.
         path: the file; replaced in one go.
         state: from `init` or the last `step`; None for the controller alone.
-
-    Returns:
-        The path written.
     """
     parts = _parts(controller)
     tuning = {
@@ -72,9 +70,6 @@ def save_controller(
 def load_controller(path: str | Path) -> tuple[AnyController, ControllerState | None]:
     """Read what `save_controller` wrote.
 
-    Args:
-        path: the file.
-
     Returns:
         ``(controller, state)``; the state is None if none was saved.
 
@@ -82,16 +77,11 @@ def load_controller(path: str | Path) -> tuple[AnyController, ControllerState | 
         InputError: naming the field, for files that cannot be read or are of another version, and for everything that
             the constructors refuse.
     """
-    try:
-        body = json.loads(Path(path).read_text())
-    except (OSError, ValueError) as error:
-        raise InputError("controller file", str(path), f"a readable JSON file ({error})") from error
+    body = read_json("controller file", path)
     if not isinstance(body, dict) or body.get("format") != FORMAT:
         found = body.get("format") if isinstance(body, dict) else type(body).__name__
         raise InputError("controller.format", found, f"{FORMAT!r}, as this version writes it")
-    for key in ("kind", "structure", "tuning", "model", "options", "state"):
-        if key not in body:
-            raise InputError(f"controller.{key}", "nothing", "a value (the key is missing)")
+    check_keys("controller", body, ("kind", "structure", "tuning", "model", "options", "state"))
     try:
         controller = _made(body)
         return controller, None if body["state"] is None else _restored(controller, body["state"])
@@ -148,16 +138,14 @@ def _restored(controller: AnyController, saved: Any) -> ControllerState:
     """The state with these numbers, in the form that the controller makes it."""
     if not isinstance(saved, dict):
         raise InputError("controller.state", type(saved).__name__, "an object with the fields of the state")
-    for key in ("base", "mv"):
-        if key not in saved:
-            raise InputError(f"controller.state.{key}", "nothing", "a value (the key is missing)")
+    check_keys("controller.state", saved, ("base", "mv"))
     base, mv = (_numbers(f"controller.state.{key}", saved[key]) for key in ("base", "mv"))
     fresh = controller.init(base[: controller.structure.cv_count], mv)
     wanted = _named(fresh)
-    for key in [*wanted, *saved]:
-        if key not in saved or key not in wanted:
-            expected = "a value (the key is missing)" if key in wanted else f"one of {', '.join(wanted)}"
-            raise InputError(f"controller.state.{key}", saved.get(key, "nothing"), expected)
+    check_keys("controller.state", saved, wanted)
+    for key in saved:
+        if key not in wanted:
+            raise InputError(f"controller.state.{key}", saved[key], f"one of {', '.join(wanted)}")
     leaves = []
     for key, leaf in wanted.items():
         value = _numbers(f"controller.state.{key}", saved[key])

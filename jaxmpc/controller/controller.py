@@ -21,7 +21,7 @@ from jaxtyping import ArrayLike, Bool, Float
 
 from jaxmpc import status as codes
 from jaxmpc.controller.build import Scenarios
-from jaxmpc.controller.core import ControllerState, Core, Moment, StepInfo, without
+from jaxmpc.controller.core import ControllerState, Core, Moment, StepInfo
 from jaxmpc.controller.sample import Sample, checked, checked_start
 from jaxmpc.errors import InputError
 from jaxmpc.integer.finish import finish_steps
@@ -34,98 +34,87 @@ from jaxmpc.problem.tuning import Tuning
 from jaxmpc.programs.clock import Clock
 from jaxmpc.programs.compilation import compiling_for
 from jaxmpc.programs.lanes import Lanes
-from jaxmpc.programs.packing import Packing, flattened, rebuilt
+from jaxmpc.programs.packing import PackedCall, flattened, rebuilt
 from jaxmpc.relaxed.gap import check_gap, check_time_limit, relative_gap
 
 KEPT = 8  # combinations of CVs that are switched off, with what their searches need
 
 
-class Controllers:
-    """Controllers that advance together, one per scenario.
+class Relaxers:
+    """Compiled relaxations of scenarios by the steps of their integer ranges, made when first needed."""
 
-    Args:
-        structure: for all, or one per scenario; with CVs and MVs of the same names.
-        tunings: one per scenario, or a single one for all.
-        models: one per scenario, or a single one for all.
-        count: number of scenarios where it does not follow.
-        gap: relative gap of a solve with whole moves.
-        time_limit: seconds of work per scenario and sample, None for none.
-        finish: path that closes the integer problems, see `jaxmpc.integer.solve`.
+    def __init__(self, scenarios: Scenarios, made: dict[int, Relaxer]):
+        self.scenarios, self.made = scenarios, made
+        self._reduced: dict[bytes, Relaxers] = {}
 
-    Raises:
-        InputError: naming what does not fit.
-    """
+    def __call__(self, envelope: int) -> Relaxer:
+        """For integer ranges of so many steps."""
+        if envelope not in self.made:
+            qps = self.scenarios.problems(envelope)
+            self.made[envelope] = Relaxer(qps, self.scenarios.constants(qps))
+        return self.made[envelope]
 
-    def __init__(
-        self,
-        structure: Structure | Sequence[Structure],
-        tunings: Tuning | Sequence[Tuning],
-        models: StepResponseModel | Sequence[StepResponseModel],
-        *,
-        count: int | None = None,
-        gap: float = 1e-6,
-        time_limit: float | None = None,
-        finish: str = "auto",
-    ):
-        if finish not in FINISHES:
-            raise InputError("finish", finish, f"one of {', '.join(FINISHES)}")
-        self.gap, self.time_limit = check_gap("gap", gap), check_time_limit("time_limit", time_limit)
-        self.finish = finish
-        some: Callable[[Any, type], Any] = lambda given, kind: [given] if isinstance(given, kind) else given  # noqa: E731
-        given = some(structure, Structure), some(tunings, Tuning), some(models, StepResponseModel)
-        self._take(Scenarios(*given, count))
+    def part(self, index: np.ndarray) -> Relaxers:
+        """Of some of the scenarios."""
+        return Relaxers(
+            self.scenarios.part(index), {key: made.part(index) for key, made in self.made.items()}
+        )
 
-    def _take(self, scenarios: Scenarios) -> None:
-        self.scenarios, self.count, self.size = scenarios, scenarios.count, scenarios.size
-        self.structure = scenarios.structure
-        with compiling_for(str(self.size)):
-            qps = scenarios.problems(1)
-        constants = scenarios.constants(qps) if scenarios.integers else []
-        self.cores = scenarios.core(qps, constants)
-        self._relaxers = {1: Relaxer(qps, constants)} if scenarios.integers else {}
-        self.decided = False  # whether a step has been
-        self._without: dict[bytes, Controllers] = {}
-        self._packings: tuple[Packing, Packing] | None = None
+    def without(self, off: Bool[np.ndarray, "scenario cv"]) -> Relaxers:
+        """The same without the CVs that are switched off."""
+        pattern = off.tobytes()
+        if not off.any():
+            return self
+        if pattern not in self._reduced:
+            self._reduced[pattern] = Relaxers(self.scenarios.without(off), {})
+            while len(self._reduced) > KEPT:
+                self._reduced.pop(next(iter(self._reduced)))
+        return self._reduced[pattern]
 
-    def part(self, index: np.ndarray) -> Controllers:
+
+@dataclasses.dataclass(eq=False)
+class Batch:
+    """Controllers that are built: the lanes of `Controllers`, or some of them."""
+
+    scenarios: Scenarios  # what they are made of
+    cores: Lanes[Core]  # what compiled programs know of them
+    relaxers: Relaxers  # what searches on the host need
+    gap: float
+    time_limit: float | None
+    finish: str
+    decided: bool = False  # whether a step has been
+
+    def __post_init__(self):
+        self.count, self.size = self.scenarios.count, self.scenarios.size
+        self.structure = self.scenarios.structures[0]
+        self._step = PackedCall(_stepped)
+
+    def part(self, index: np.ndarray) -> Batch:
         """The controllers of some scenarios, which share what is computed already."""
         if self.count == len(index) and (index == np.arange(self.count)).all():
             return self
-        some = object.__new__(Controllers)
-        some.gap, some.time_limit, some.finish = self.gap, self.time_limit, self.finish
-        some.scenarios, some.count, some.size = self.scenarios.part(index), len(index), self.size
-        some.structure, some.cores = self.scenarios.structures[index[0]], self.cores.take(index)
-        some._relaxers = {envelope: relaxer.part(index) for envelope, relaxer in self._relaxers.items()}
-        some.decided, some._without, some._packings = self.decided, {}, None
-        return some
+        relaxers = self.relaxers.part(index)
+        own = self.gap, self.time_limit, self.finish, self.decided
+        return Batch(relaxers.scenarios, self.cores.take(index), relaxers, *own)
 
-    def repeated(self, count: int) -> Controllers:
+    def repeated(self, count: int) -> Batch:
         """So many copies of a single controller, which share everything."""
         return self.part(np.zeros(count, dtype=int))
-
-    def relaxer(self, envelope: int) -> Relaxer:
-        """Compiled relaxations for integer ranges of so many steps, made when first needed."""
-        if envelope not in self._relaxers:
-            qps = self.scenarios.problems(envelope)
-            self._relaxers[envelope] = Relaxer(qps, self.scenarios.constants(qps))
-        return self._relaxers[envelope]
 
     @property
     def searching(self) -> bool:
         """Whether whole moves may be searched for in a compiled call, which nothing interrupts."""
-        unhurried = self.time_limit is None or self.time_limit >= UNINTERRUPTED
-        return self.finish == "auto" and unhurried
+        return in_one_call(self.finish, self.time_limit)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but forms of trees, which are of no use outside this process."""
-        return {key: value for key, value in self.__dict__.items() if key != "flat"} | {"_packings": None}
+        return {key: value for key, value in self.__dict__.items() if key != "flat"}
 
     @functools.cached_property
     def flat(self) -> tuple[list[jax.Array], Any]:
         """All that compiled programs know, taken apart."""
         return flattened(self.cores)
 
-    # ---- steps
     def init(
         self, cv: Float[ArrayLike, "scenario cv"], mv: Float[ArrayLike, "scenario mv"]
     ) -> ControllerState:
@@ -155,17 +144,21 @@ class Controllers:
         sample = sample._replace(setpoint=self.over_horizon(sample.setpoint))
         settings = np.tile([self.gap, float(self.searching)], (self.count, 1))
         given = jax.tree.map(np.asarray, (state, sample, settings))
-        leaves, form = self.flat
         with compiling_for(str(self.size)):
-            packings = self._packing(given)
-            packed = np.asarray(_step(leaves, packings[0].pack(given), form, packings[0]))
-        state, info, moment = packings[1].unpack(packed)
+            state, info, moment = self._step(self.cores, self.flat, *given)
         seconds = np.full(self.count, clock.seconds / self.count)
-        left = ~moment.decision.closed & self.integer
-        if left.any():
-            state, info, seconds = self._finished(moment, info, left, seconds)
+        fields: dict[str, Any] = {"solve_time": seconds}
+        left = np.flatnonzero(~moment.decision.closed & self.integer)
+        if left.size:
+            x, good, said = self.finish_open(moment, left, seconds[left])
+            for name, values in said.items():
+                fields[name] = seconds if name == "solve_time" else np.array(getattr(info, name))
+                fields[name][left] = values
+            leaves, form = self.flat
+            state, moves = jax.tree.map(np.asarray, _carry_out(leaves, moment, x, good, form))
+            fields |= dict(move=moves[:, 0], mv=state.mv, moves=moves)
         self.decided = True
-        return state, eqx.tree_at(lambda i: i.solve_time, info, seconds)
+        return state, dataclasses.replace(info, **fields)
 
     @functools.cached_property
     def integer(self) -> Bool[np.ndarray, " scenario"]:
@@ -179,95 +172,109 @@ class Controllers:
         more = max(self.size.future - rows.shape[1], 0)
         return xp.concatenate([rows, xp.repeat(rows[:, -1:], more, axis=1)], axis=1)[:, : self.size.future]
 
-    def _packing(self, given: Any) -> tuple[Packing, Packing]:
-        """Of what goes into a step and what comes out."""
-        if self._packings is None:
-            out = jax.eval_shape(_stepped, self.cores, *given)
-            self._packings = Packing.of(given), Packing.of(out)
-        return self._packings
-
-    def _finished(self, moment: Moment, info: StepInfo, left: np.ndarray, seconds: np.ndarray) -> tuple:
-        """State, info and times with the scenarios that the compiled program left open decided on the host."""
-        which = np.flatnonzero(left)
-        results = self.finish_open(moment, which, seconds[which])
-        found = moment.decision
-        x, good = found.x.copy(), found.closed & np.isfinite(found.x).all(axis=1)
-        fields = {
-            name: np.array(getattr(info, name))
-            for name in ("status", "fallback", "objective", "bound", "gap", "nodes", "finished_by")
-        }
-        seconds = seconds.copy()
-        for i, result in zip(which, results, strict=True):
-            good[i] = result.x is not None
-            if result.x is not None:
-                x[i] = result.x
-            said = said_of(result, float(moment.unit[i]))
-            for name, values in fields.items():
-                values[i] = said[name]
-            seconds[i] = result.seconds
-        leaves, form = self.flat
-        state, moves = jax.tree.map(np.asarray, _carry_out(leaves, moment, x, good, form))
-        changed = dict(fields, move=moves[:, 0], mv=state.mv, moves=moves)
-        return state, dataclasses.replace(info, **changed), seconds
-
-    def finish_open(self, moment: Moment, which: np.ndarray, spent: np.ndarray) -> list[SearchResult]:
-        """Results of scenarios that are decided on the host.
+    def finish_open(
+        self, moment: Moment, which: np.ndarray, spent: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """Decide scenarios on the host that the compiled program left open.
 
         Args:
             moment: of all scenarios, with NumPy's arrays.
-            which: scenarios to decide.
-            spent: seconds they have taken already.
+            spent: seconds that each of them has taken already.
+
+        Returns:
+            Plans of all scenarios, whether there is one, and what those that were decided here say of themselves, by the
+            names of `StepInfo` and `Trajectory`.
         """
+        x, good = np.array(moment.decision.x), np.array(moment.good)
         results: dict[int, SearchResult] = {}
         structures = [self.scenarios.structures[i] for i in which]
         for structure in dict.fromkeys(structures):
-            index = np.array([i for i, its in zip(which, structures, strict=True) if its == structure])
-            time = float(spent[np.isin(which, index)].mean())
-            results |= zip(index, self._finish_some(moment, index, time), strict=True)
-        return [results[i] for i in which]
+            own = np.array([its == structure for its in structures])
+            results |= zip(which[own], self._finish_some(moment, which[own], spent[own].mean()), strict=True)
+        for i, result in results.items():
+            good[i] = result.x is not None
+            if result.x is not None:
+                x[i] = result.x
+        self.decided = True
+        said = [_said(results[i], float(moment.unit[i])) for i in which]
+        return x, good, {name: np.array([one[name] for one in said]) for name in said[0]}
 
     def _finish_some(self, moment: Moment, index: np.ndarray, spent: float) -> list[SearchResult]:
         """Of scenarios of one structure."""
         own: Moment = jax.tree.map(lambda leaf: np.asarray(leaf)[index], moment)
-        off = np.asarray(moment.state.sensors.off)
-        controllers = self._reduced(off) if off[index].any() else self
+        relaxers = self.relaxers.without(np.asarray(moment.state.sensors.off))
         try:
             with compiling_for(str(self.size)):
                 return finish_steps(
-                    functools.cache(lambda envelope: controllers.relaxer(envelope).part(index)),
+                    functools.cache(lambda envelope: relaxers(envelope).part(index)),
                     own.instance,
                     Relaxations.of(own.decision.root),
                     previous_moves=own.state.plan,  # pyright: ignore[reportArgumentType]
                     gap=self.gap,
                     time_limit=self.time_limit,
                     finish=self.finish,
-                    spent=spent,
+                    spent=float(spent),
                 )
         except InputError:  # moves without limits have ranges that follow from the measurements
             if not self.decided:
                 raise
-            return [SearchResult(None, np.inf, -np.inf, codes.FAILED, None, 0, seconds=spent)] * len(index)
-
-    def _reduced(self, off: Bool[np.ndarray, "scenario cv"]) -> Controllers:
-        """These controllers without the CVs that are switched off."""
-        pattern = off.tobytes()
-        if pattern not in self._without:
-            scenarios = self.scenarios
-            made = {
-                (id(t), own.tobytes()): without(t, own) for t, own in zip(scenarios.tunings, off, strict=True)
-            }
-            tunings = [made[id(t), own.tobytes()] for t, own in zip(scenarios.tunings, off, strict=True)]
-            reduced = object.__new__(Controllers)
-            reduced.gap, reduced.time_limit, reduced.finish = self.gap, self.time_limit, self.finish
-            reduced._take(scenarios.with_tunings(tunings))
-            self._without[pattern] = reduced
-            while len(self._without) > KEPT:
-                self._without.pop(next(iter(self._without)))
-        return self._without[pattern]
+            return [SearchResult(None, np.inf, -np.inf, codes.FAILED, None, 0, seconds=float(spent))] * len(
+                index
+            )
 
 
-def said_of(result: SearchResult, unit: float) -> dict[str, Any]:
-    """What a step that was decided on the host says of itself, by the names of `StepInfo` and `Trajectory`."""
+class Controllers(Batch):
+    """Controllers that advance together, one per scenario.
+
+    Args:
+        structure: for all, or one per scenario; with CVs and MVs of the same names.
+        tunings: one per scenario, or a single one for all.
+        models: one per scenario, or a single one for all.
+        count: number of scenarios where it does not follow.
+        gap: relative gap of a solve with whole moves.
+        time_limit: seconds of work per scenario and sample, None for none.
+        finish: path that closes the integer problems, see `jaxmpc.integer.solve`.
+
+    Raises:
+        InputError: naming what does not fit.
+    """
+
+    def __init__(
+        self,
+        structure: Structure | Sequence[Structure],
+        tunings: Tuning | Sequence[Tuning],
+        models: StepResponseModel | Sequence[StepResponseModel],
+        *,
+        count: int | None = None,
+        gap: float = 1e-6,
+        time_limit: float | None = None,
+        finish: str = "auto",
+    ):
+        options = check_gap("gap", gap), check_time_limit("time_limit", time_limit), check_finish(finish)
+        some: Callable[[Any, type], Any] = lambda given, kind: [given] if isinstance(given, kind) else given  # noqa: E731
+        given = some(structure, Structure), some(tunings, Tuning), some(models, StepResponseModel)
+        scenarios = Scenarios.checked(*given, count)
+        with compiling_for(str(scenarios.size)):
+            qps = scenarios.problems(1)
+        constants = scenarios.constants(qps) if scenarios.integers else []
+        relaxers = Relaxers(scenarios, {1: Relaxer(qps, constants)} if scenarios.integers else {})
+        super().__init__(scenarios, scenarios.core(qps, constants), relaxers, *options)
+
+
+def check_finish(finish: str) -> str:
+    """A path that closes integer problems, or an `InputError`."""
+    if finish not in FINISHES:
+        raise InputError("finish", finish, f"one of {', '.join(FINISHES)}")
+    return finish
+
+
+def in_one_call(finish: str, time_limit: float | None) -> bool:
+    """Whether whole moves may be searched for in a compiled call, which nothing interrupts."""
+    return finish == "auto" and (time_limit is None or time_limit >= UNINTERRUPTED)
+
+
+def _said(result: SearchResult, unit: float) -> dict[str, Any]:
+    """What a step that was decided on the host says of itself; see `Moment.said`."""
     found = result.x is not None
     value, bound = (result.value, result.bound) if found else (np.nan, np.nan)
     return {
@@ -278,14 +285,14 @@ def said_of(result: SearchResult, unit: float) -> dict[str, Any]:
         "gap": relative_gap(value, bound, unit),
         "nodes": result.nodes,
         "finished_by": codes.finisher_code(result.finished_by) if found else 0,
+        "solve_time": result.seconds,
     }
 
 
 @functools.partial(jax.jit, static_argnames="form")
 def _init(leaves, cv, mv, form) -> ControllerState:
     cores: Lanes[Core] = rebuilt(form, leaves)
-    one = lambda own, cv, mv: eqx.combine(own, cores.shared).init(cv, mv)  # noqa: E731
-    return jax.vmap(one)(cores.each, cv, mv)
+    return cores.vmap(lambda core, *start: core.init(*start), cv, mv)
 
 
 @jax.jit
@@ -293,39 +300,24 @@ def considered(cores: Lanes[Core], state: ControllerState, sample: Sample, setti
     """A sample of all scenarios, decided as far as a compiled program decides it.
 
     Args:
-        cores: of the controllers.
-        state: before the sample.
-        sample: what is known.
         settings: ``"scenario 2"``, relative gap, and whether whole moves may be searched for (1 or 0).
     """
 
-    def one(own, state, sample, settings):
-        core: Core = eqx.combine(own, cores.shared)
+    def one(core: Core, state, sample, settings):
         return core.consider(state, sample, settings[0], settings[1] > 0)
 
-    return jax.vmap(one)(cores.each, state, sample, settings)
+    return cores.vmap(one, state, sample, settings)
 
 
-@jax.jit
 def _stepped(cores: Lanes[Core], state, sample, settings) -> tuple:
     moments = considered(cores, state, sample, settings)
-    return *jax.vmap(lambda own, moment: eqx.combine(own, cores.shared).conclude(moment))(
-        cores.each, moments
-    ), moments
-
-
-@functools.partial(jax.jit, static_argnames=("form", "packing"))
-def _step(leaves, packed, form, packing: Packing):
-    """State, info and moment of all scenarios; goes in and comes out packed."""
-    out = _stepped(rebuilt(form, leaves), *packing.unpack(packed))
-    return Packing.of(out).pack(out)
+    return *cores.vmap(lambda core, moment: core.conclude(moment), moments), moments
 
 
 @functools.partial(jax.jit, static_argnames="form")
 def _carry_out(leaves, moment: Moment, x, good, form):
     cores: Lanes[Core] = rebuilt(form, leaves)
-    one = lambda own, *rest: eqx.combine(own, cores.shared).carry_out(*rest)  # noqa: E731
-    return jax.vmap(one)(cores.each, moment, x, good)
+    return cores.vmap(lambda core, *plan: core.carry_out(*plan), moment, x, good)
 
 
 class Controller:
@@ -335,9 +327,6 @@ class Controller:
     may be traced as well.
 
     Args:
-        structure: static configuration.
-        tuning: weights and limits.
-        model: step-response model.
         gap: relative gap of a solve with whole moves.
         time_limit: seconds per solve, None for none.
         finish: path that closes the integer problem, see `jaxmpc.integer.solve`.
@@ -395,9 +384,6 @@ class Controller:
             mv: where the actuators stand before the move [MV unit], NaN where that is not known; without it, demands
                 count as followed.
             manual: MVs that somebody else moves; they are predicted from `mv` and not moved.
-
-        Returns:
-            The state after the sample, and what was done.
 
         Raises:
             InputError: for other shapes, setpoints that are not finite, and where double precision is off.

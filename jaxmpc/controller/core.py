@@ -7,6 +7,7 @@ solve that gives no plan holds the MVs, and the info says so.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -23,7 +24,7 @@ from jaxmpc.controller.sample import Sample
 from jaxmpc.integer.search import Decision, decide
 from jaxmpc.integer.tables import Tables
 from jaxmpc.model.step_response import advance_free_response, shift_free_response
-from jaxmpc.problem.condense import CondensedQp, condense, matrices_of
+from jaxmpc.problem.condense import CondensedQp, Matrices, condense, matrices_of
 from jaxmpc.problem.instance import QpInstance, make_instance
 from jaxmpc.problem.layout import Layout, Size
 from jaxmpc.problem.tuning import Tuning
@@ -33,35 +34,20 @@ from jaxmpc.relaxed.solve import cold_start, shifted_start
 
 
 class ControllerState(eqx.Module):
-    """What a controller remembers from sample to sample.
+    """What a controller remembers from sample to sample."""
 
-    Attributes:
-        base: CVs the run started from; predictions are deviations from them [CV unit].
-        future: effect of the moves made so far on the samples from now on [CV unit].
-        bias: filtered output bias v(k|k).
-        bias_raw: output bias before the filter (2.31b).
-        mv: present demand [MV unit].
-        position: where the actuators stand in the predictions [MV unit].
-        last_move: previous move, of the actuators where these are told [MV unit].
-        past_moves: the last moves, oldest first [MV unit].
-        plan: the previous plan shifted by one sample, block moves [MV unit].
-        warm: moves and prices of the previous relaxation, shifted; where the next solve starts.
-        sensors: what the measurements were worth.
-        manual: MVs that somebody else moved at the last sample.
-    """
-
-    base: Float[Array, " cv"]
-    future: Float[Array, "cv future"]
-    bias: Float[Array, " cv"]
-    bias_raw: Float[Array, " cv"]
-    mv: Float[Array, " mv"]
-    position: Float[Array, " mv"]
-    last_move: Float[Array, " mv"]
-    past_moves: Float[Array, "past mv"]
-    plan: Float[Array, "block mv"]
-    warm: WarmStart
-    sensors: Sensors
-    manual: Bool[Array, " mv"]
+    base: Float[Array, " cv"]  # CVs the run started from; predictions are deviations from them [CV unit]
+    future: Float[Array, "cv future"]  # effect of the moves made so far on the samples from now on [CV unit]
+    bias: Float[Array, " cv"]  # filtered output bias v(k|k)
+    bias_raw: Float[Array, " cv"]  # output bias before the filter (2.31b)
+    mv: Float[Array, " mv"]  # present demand [MV unit]
+    position: Float[Array, " mv"]  # where the actuators stand in the predictions [MV unit]
+    last_move: Float[Array, " mv"]  # previous move, of the actuators where these are told [MV unit]
+    past_moves: Float[Array, "past mv"]  # the last moves, oldest first [MV unit]
+    plan: Float[Array, "block mv"]  # the previous plan shifted by one sample, block moves [MV unit]
+    warm: WarmStart  # moves and prices of the previous relaxation, shifted; where the next solve starts
+    sensors: Sensors  # what the measurements were worth
+    manual: Bool[Array, " mv"]  # MVs that somebody else moved at the last sample
 
 
 class StepInfo(eqx.Module):
@@ -99,55 +85,52 @@ class StepInfo(eqx.Module):
 
 
 class Moment(NamedTuple):
-    """A sample that is observed and decided as far as a compiled program decides it.
+    """A sample that is observed and decided as far as a compiled program decides it."""
 
-    Attributes:
-        state: after the measurement.
-        free_response: Lambda (5.13) at j = 1, 2, ... [CV unit].
-        instance: its problem.
-        decision: what the search found.
-        scale: MV units per unit of x.
-        unit: of the objective, see `gap.closes`.
-        recovering: whether an MV is outside its limits.
-    """
+    state: ControllerState  # after the measurement
+    free_response: Float[Array, "future cv"]  # Lambda (5.13) at j = 1, 2, ... [CV unit]
+    instance: QpInstance  # its problem
+    decision: Decision  # what the search found
+    scale: Float[Array, " n"]  # MV units per unit of x
+    unit: Float[Array, ""]  # of the objective, see `gap.closes`
+    recovering: Bool[Array, ""]  # whether an MV is outside its limits
 
-    state: ControllerState
-    free_response: Float[Array, "future cv"]
-    instance: QpInstance
-    decision: Decision
-    scale: Float[Array, " n"]
-    unit: Float[Array, ""]
-    recovering: Bool[Array, ""]
+    @property
+    def good(self) -> Bool[Array, ""]:
+        """Whether the compiled program has closed it."""
+        return self.decision.closed & (abs(self.decision.x) < np.inf).all(axis=-1)
+
+    def said(self, whole: Bool[Array, ""]) -> dict[str, Array]:
+        """What the decision says of itself, by the names of `StepInfo` and `Trajectory`; `whole`: of whole moves."""
+        found, sensors, good = self.decision, self.state.sensors, self.good
+        certified = lambda value: jnp.where(good, value, jnp.nan)  # noqa: E731
+        return dict(
+            status=jnp.where(good, codes.OPTIMAL, codes.FAILED),
+            fallback=~good,
+            quality=sensors.quality,
+            off=sensors.off,
+            objective=certified(found.value),
+            bound=certified(found.bound),
+            gap=certified(relative_gap(found.value, found.bound, self.unit)),
+            nodes=jnp.where(whole, found.nodes, found.steps),
+            finished_by=jnp.where(good, found.finished_by, 0),
+        )
 
 
 class Core(eqx.Module):
-    """Everything of a controller that stays the same from sample to sample, as arrays of a size.
+    """Everything of a controller that stays the same from sample to sample, as arrays of a size."""
 
-    Attributes:
-        layout: the structure.
-        tuning: weights and limits.
-        coefficients: of the model, as long as the shift register [CV unit per MV unit].
-        qp: constant part of the problems.
-        tables: what the search for whole moves reads.
-        size: of the arrays.
-        switching: whether a CV may be switched off by bad measurements.
-    """
-
-    layout: Layout
-    tuning: Tuning
+    layout: Layout  # the structure
+    tuning: Tuning  # weights and limits
+    # of the model, as long as the shift register [CV unit per MV unit]
     coefficients: Float[Array, "cv mv future"]
-    qp: CondensedQp
-    tables: Tables
-    size: Size = eqx.field(static=True)
-    switching: bool = eqx.field(static=True)
+    qp: CondensedQp  # constant part of the problems
+    tables: Tables  # what the search for whole moves reads
+    size: Size = eqx.field(static=True)  # of the arrays
+    switching: bool = eqx.field(static=True)  # whether a CV may be switched off by bad measurements
 
     def init(self, cv: Float[Array, " cv"], mv: Float[Array, " mv"]) -> ControllerState:
-        """State of a controller that starts in a steady state.
-
-        Args:
-            cv: measured CVs [CV unit].
-            mv: present MVs [MV unit].
-        """
+        """State of a controller that starts in a steady state."""
         s, zeros = self.size, lambda *shape: jnp.zeros(shape)
         cv, mv = jnp.asarray(cv, dtype=jnp.float64), jnp.asarray(mv, dtype=jnp.float64)
         state = ControllerState(
@@ -172,7 +155,6 @@ class Core(eqx.Module):
         """Predict from where the actuators stand, as if they had moved there in place of the last move.
 
         Args:
-            state: from `init` or `remember`.
             mv: ``"mv"``, positions now [MV unit]; not a number where the demand counts as followed.
             manual: ``"mv"``, MVs that somebody else moves.
 
@@ -206,9 +188,7 @@ class Core(eqx.Module):
         """Compare a measurement with its prediction, update the bias, and move on to the next sample.
 
         Args:
-            state: from `init` or `remember`; its future starts at the present sample.
             cv: measurement now [CV unit]; a bad one leaves the bias to itself.
-            mv, manual: as in `locate`.
 
         Returns:
             ``(state, free_response)``: the future now starts at the next sample; Lambda (5.13) at j = 1, 2, ....
@@ -267,23 +247,21 @@ class Core(eqx.Module):
             given = self.qp
             matrices = matrices_of(self.layout, self.size, self.coefficients, summed=False)
             matrices = eqx.tree_at(lambda m: m.summed, matrices, given.summed, is_leaf=lambda v: v is None)
-            levels, tuning = given.steep.shape[0], without(self.tuning, off)
-            return condense(
-                self.layout, self.size, tuning, matrices, envelope=levels, has_limits=given.has_limits
-            )
+            return self.condensed(without(self.tuning, off), matrices)
 
         qp = jax.lax.cond(jnp.any(off), reduced, lambda: self.qp)
         known = self.tables.known & ~jnp.any(off)
-        scale = jnp.maximum(jnp.max(jnp.diagonal(qp.curvature)), 1e-12)
-        return qp, eqx.tree_at(lambda t: (t.known, t.scale), self.tables, (known, scale))
+        return qp, eqx.tree_at(lambda t: (t.known, t.scale), self.tables, (known, qp.unit))
+
+    def condensed(self, tuning: Tuning, matrices: Matrices) -> CondensedQp:
+        """The constant part of another tuning or model, in the form of this one's."""
+        form: dict[str, Any] = dict(envelope=self.qp.steep.shape[0], has_limits=self.qp.has_limits)
+        return condense(self.layout, self.size, tuning, matrices, **form)
 
     def consider(self, state: ControllerState, sample: Sample, gap, search=True) -> Moment:
         """Observe, pose and decide a sample.
 
         Args:
-            state: before it.
-            sample: what is known.
-            gap: relative gap at which whole moves are optimal.
             search: whether whole moves may be searched for here; otherwise none but the relaxation is solved.
         """
         state, free_response = self.observe(state, sample.cv, sample.mv, sample.manual)
@@ -299,11 +277,6 @@ class Core(eqx.Module):
         self, moment: Moment, x: Float[Array, " n"], good: Bool[Array, ""]
     ) -> tuple[ControllerState, Float[Array, "block mv"]]:
         """Apply the first moves of a plan; the MVs are held where there is none.
-
-        Args:
-            moment: the sample.
-            x: the plan.
-            good: whether there is one.
 
         Returns:
             ``(state, planned moves)``: predictions, history, and plan and prices shifted by one sample.
@@ -321,24 +294,18 @@ class Core(eqx.Module):
         """The state after moves of which the first was made: predictions, history, plan and prices of the next sample.
 
         Args:
-            state: from `observe`.
             moves: the plan [MV unit], padded.
-            warm: of its relaxation.
         """
         move = moves[0]
-        return ControllerState(
-            base=state.base,
+        return dataclasses.replace(
+            state,
             future=advance_free_response(state.future, self.moving(state.mv, move), move),
-            bias=state.bias,
-            bias_raw=state.bias_raw,
             mv=state.mv + move,
             position=state.position + move,
             last_move=move,
             past_moves=jnp.concatenate([state.past_moves[1:], move[None]]),
             plan=self.layout.shift @ moves,
             warm=shifted_start(warm, self.size.cvs),
-            sensors=state.sensors,
-            manual=state.manual,
         )
 
     def moving(self, before: Float[Array, " mv"], move: Float[Array, " mv"]) -> Float[Array, "cv mv future"]:
@@ -355,27 +322,9 @@ class Core(eqx.Module):
 
     def conclude(self, moment: Moment) -> tuple[ControllerState, StepInfo]:
         """Carry out what the compiled program decided; the MVs are held where it left something open."""
-        found = moment.decision
-        good = found.closed & jnp.all(jnp.isfinite(found.x))
-        state, moves = self.carry_out(moment, found.x, good)
-        certified = lambda value: jnp.where(good, value, jnp.nan)  # noqa: E731
-        info = StepInfo(
-            move=moves[0],
-            mv=state.mv,
-            moves=moves,
-            status=jnp.where(good, codes.OPTIMAL, codes.FAILED),
-            fallback=~good,
-            recovering=moment.recovering,
-            quality=state.sensors.quality,
-            off=state.sensors.off,
-            objective=certified(found.value),
-            bound=certified(found.bound),
-            gap=certified(relative_gap(found.value, found.bound, moment.unit)),
-            nodes=jnp.where(self.tables.count == 0, found.steps, found.nodes),
-            finished_by=jnp.where(good, found.finished_by, 0),
-            solve_time=jnp.asarray(jnp.nan),
-        )
-        return state, info
+        state, moves = self.carry_out(moment, moment.decision.x, moment.good)
+        own: dict[str, Any] = dict(move=moves[0], mv=state.mv, moves=moves, solve_time=jnp.asarray(jnp.nan))
+        return state, StepInfo(**own, recovering=moment.recovering, **moment.said(self.tables.count > 0))
 
 
 def outside_limits(tuning: Tuning, mv: Float[Array, " mv"]) -> Bool[Array, ""]:

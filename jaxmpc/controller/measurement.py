@@ -2,7 +2,7 @@
 
 A measurement is bad that is not a number, lies outside its validation limits, or has not changed for too long. The bias of
 its CV is kept or fades, the other CVs go on; after so many in a row the CV is switched off, and the first good
-one brings it back. `controller.Memory` judges every sample; `fault_errors` makes sensors fail in closed loops.
+one brings it back. `Core.observe` judges every sample; `fault_errors` makes sensors fail in closed loops.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from jaxmpc.check import is_number
 from jaxmpc.errors import InputError
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
@@ -103,28 +104,24 @@ def fault_errors(
     """Errors of the sensors, for `jaxmpc.simulate`: NaN where nothing arrives, `STUCK` where the last value is repeated.
 
     Args:
-        structure: gives names and sampling interval.
-        samples: length of the run.
         faults: where two meet, the later one in the list holds.
-        path: prefix of the field names in errors.
 
     Raises:
         InputError: naming the fault and the field, for unknown CVs and kinds, and times outside the run.
     """
     errors = np.zeros((samples, structure.cv_count))
-    finite = lambda value: isinstance(value, (int, float, np.number)) and np.isfinite(value)  # noqa: E731
     for i, fault in enumerate(faults):
         at, length = f"{path}[{i}]", samples * structure.dt
         if fault.cv not in structure.cv_names:
             raise InputError(f"{at}.cv", fault.cv, f"one of the CVs {', '.join(structure.cv_names)}")
         if fault.kind not in FAULTS:
             raise InputError(f"{at}.kind", fault.kind, f"one of {', '.join(FAULTS)}")
-        if not finite(fault.time) or not 0 <= fault.time < length:
+        if not is_number(fault.time) or not 0 <= fault.time < length:
             raise InputError(f"{at}.time", fault.time, f"a time within the run, 0 to less than {length:g} s")
         duration = structure.dt if fault.duration is None else fault.duration
-        if not finite(duration) or duration <= 0:
+        if not is_number(duration) or duration <= 0:
             raise InputError(f"{at}.duration", duration, "a positive duration [s]")
-        if not finite(fault.size):
+        if not is_number(fault.size):
             raise InputError(f"{at}.size", fault.size, "a finite size [CV unit]")
         error = {"missing": np.nan, "spike": fault.size, "frozen": STUCK}[fault.kind]
         first, last = (int(np.ceil(t / structure.dt - 1e-9)) for t in (fault.time, fault.time + duration))
@@ -137,7 +134,6 @@ def received(sound: ArrayLike, fault: ArrayLike, before: ArrayLike) -> Any:
 
     Args:
         sound: what they would measure without fault, ``"... cv"`` [CV unit].
-        fault: of `fault_errors`.
         before: what arrived one sample ago, ``"... cv"`` [CV unit].
     """
     xp: Any = np if all(isinstance(v, np.ndarray) for v in (sound, fault, before)) else jnp

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,27 +17,26 @@ from numpy.typing import ArrayLike
 
 from jaxmpc import html
 from jaxmpc import status as codes
-from jaxmpc.check import LARGEST, check_vector, sound
-from jaxmpc.controller.controller import Controllers, one_lane
+from jaxmpc.controller.case import check_position, step_array
+from jaxmpc.controller.controller import Controllers, check_finish, in_one_call, one_lane
 from jaxmpc.controller.core import Core
 from jaxmpc.controller.sample import require_double_precision
-from jaxmpc.errors import InputError
 from jaxmpc.integer.finish import finish_steps
 from jaxmpc.integer.host_search import SearchResult
 from jaxmpc.integer.relaxer import Relaxations
-from jaxmpc.integer.search import Decision, decide
-from jaxmpc.integer.solve import FINISHES, UNINTERRUPTED, continuous_feasible
+from jaxmpc.integer.search import Decision, Relaxed, decide
+from jaxmpc.integer.solve import continuous_feasible
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.blocking import moves_per_block, sample_moves
 from jaxmpc.problem.condense import dynamic_matrix
-from jaxmpc.problem.instance import DRIFT, QpInstance, make_instance
+from jaxmpc.problem.instance import QpInstance, make_instance
 from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
 from jaxmpc.programs.clock import Clock
 from jaxmpc.programs.compilation import compiling_for
 from jaxmpc.programs.lanes import Lanes
-from jaxmpc.programs.packing import Packing, rebuilt
+from jaxmpc.programs.packing import PackedCall
 from jaxmpc.relaxed.gap import check_gap, check_time_limit, closes, relative_gap
 from jaxmpc.relaxed.newton import WarmStart
 
@@ -80,15 +79,9 @@ class Plan:
         return html.plan(self)
 
 
-class Posed(NamedTuple):
-    """A step that is posed and decided as far as a compiled program decides it; all arrays with a lane axis."""
-
-    instance: QpInstance
-    decision: Decision
-
-
-def _plan(core: Core, given, settings) -> Posed:
-    free_response, setpoint, mv_now, last_move, past_moves, start = given
+def _one_posed(
+    core: Core, free_response, setpoint, mv_now, last_move, past_moves, start, settings
+) -> tuple[QpInstance, Decision]:
     instance = make_instance(
         core.layout,
         core.size,
@@ -102,29 +95,16 @@ def _plan(core: Core, given, settings) -> Posed:
         recover=settings[2] > 0,
     )
     tables = eqx.tree_at(lambda t: t.known, core.tables, core.tables.known & (settings[1] > 0))
-    return Posed(instance, decide(core.qp, tables, instance, start, settings[0]))
+    return instance, decide(core.qp, tables, instance, start, settings[0])
 
 
-@jax.jit
-def _posed(cores: Lanes[Core], given, settings) -> Posed:
-    return jax.vmap(lambda given, settings: _plan(cores.shared, given, settings))(given, settings)
-
-
-@functools.partial(jax.jit, static_argnames=("form", "packing"))
-def _solve(leaves, packed, form, packing: Packing):
-    """A step; goes in and comes out packed."""
-    out = _posed(rebuilt(form, leaves), *packing.unpack(packed))
-    return Packing.of(out).pack(out)
+def _posed(cores: Lanes[Core], *given) -> tuple[QpInstance, Decision]:
+    """A step that is posed and decided as far as a compiled program decides it; all arrays with a lane axis."""
+    return jax.vmap(functools.partial(_one_posed, cores.shared))(*given)
 
 
 class Planner:
-    """Solves the steps of one controller.
-
-    Args:
-        structure: static configuration.
-        tuning: weights and limits.
-        model: step-response model with the same names and sampling interval.
-    """
+    """Solves the steps of one controller."""
 
     def __init__(self, structure: Structure, tuning: Tuning, model: StepResponseModel):
         self.structure, self.tuning, self.model = structure, tuning, model
@@ -137,11 +117,7 @@ class Planner:
         self._no_past = zeros(size.past, size.mvs)
         cold = jax.eval_shape(core.init, np.zeros(size.cvs), np.zeros(size.mvs)).warm
         self._cold = jax.tree.map(lambda v: np.zeros((1, *v.shape)), cold)
-        self._packings: tuple[Packing, Packing] | None = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        """What a copy needs; forms of trees do not survive a copy."""
-        return self.__dict__ | {"_packings": None}
+        self._pose = PackedCall(_posed)
 
     def solve(
         self,
@@ -161,20 +137,11 @@ class Planner:
         """Solve one step; arguments as in `solve_plan`.
 
         Args:
-            mv_now: MVs before the move.
-            last_move: previous move.
-            free_response: Lambda, ``"horizon cv"``.
-            setpoint: r, ``"horizon cv"``.
-            previous_moves: start, ``"block mv"``, or None.
             past_moves: moves of the mean-move window, ``"window mv"`` oldest first, or None.
             recover: let MVs outside their limits return the shortest way.
             warm: `Plan.warm` of a neighbouring step; ignored where its size does not fit.
-            time_limit: seconds, None for none.
-            gap: relative gap.
-            finish: one of `integer.solve.FINISHES`.
         """
-        if finish not in FINISHES:
-            raise InputError("finish", finish, f"one of {', '.join(FINISHES)}")
+        check_finish(finish)
         require_double_precision()
         gap, time_limit = check_gap("gap", gap), check_time_limit("time_limit", time_limit)
         as_array = lambda v: np.asarray(v, dtype=np.float64)  # noqa: E731
@@ -188,45 +155,40 @@ class Planner:
         if warm is not None and jax.tree.all(jax.tree.map(fits, warm, start)):
             start = jax.tree.map(lambda leaf: np.asarray(leaf)[None], warm)
         whole = self.controllers.over_horizon
-        given = (
-            *(whole(free_response[None]), whole(setpoint[None])),
-            *(mv_now[None], as_array(last_move)[None], past, start),
-        )
-        unhurried = time_limit is None or time_limit >= UNINTERRUPTED
-        settings = np.array([[gap, float(finish == "auto" and unhurried), float(recover)]])
-        clock = Clock()
-        posed = self._call((given, settings))
-        result = self._decided(posed, previous_moves, gap, time_limit, finish, clock.seconds)
-        return self._plan(posed, result, mv_now, free_response, setpoint, gap, clock)
-
-    def _call(self, given: tuple) -> Posed:
-        leaves, form = self.controllers.flat
-        with compiling_for(str(self.controllers.size)):
-            if self._packings is None:
-                shapes = jax.eval_shape(_posed, self.controllers.cores, *given)
-                self._packings = Packing.of(given), Packing.of(shapes)
-            into, out = self._packings
-            return out.unpack(np.asarray(_solve(leaves, into.pack(given), form, into)))
+        known = whole(free_response[None]), whole(setpoint[None]), mv_now[None], as_array(last_move)[None]
+        settings = np.array([[gap, float(in_one_call(finish, time_limit)), float(recover)]])
+        clock, own = Clock(), self.controllers
+        with compiling_for(str(own.size)):
+            instance, found = self._pose(own.cores, own.flat, *known, past, start, settings)
+        result = self._decided(instance, found, previous_moves, gap, time_limit, finish, clock.seconds)
+        return self._plan(one_lane(instance), result, mv_now, free_response, setpoint, gap, clock)
 
     def _decided(
-        self, posed: Posed, previous_moves, gap, time_limit, finish: str, spent: float
+        self,
+        instance: QpInstance,
+        decision: Decision,
+        previous_moves,
+        gap,
+        time_limit,
+        finish: str,
+        spent: float,
     ) -> SearchResult:
         """How the step ended, by the compiled program or on the host."""
-        found = one_lane(posed.decision)
+        found = one_lane(decision)
         if not self.structure.integer_mvs:
-            return self._relaxed(posed, gap)
+            return self._relaxed(one_lane(instance), found.root, gap)
         start = found.root.warm
         if found.closed and finish == "auto":
             by = codes.FINISHERS[int(found.finished_by)]
-            x, value, bound = found.x, float(found.value), float(found.bound)
+            x, value, bound = np.asarray(found.x), float(found.value), float(found.bound)
             return SearchResult(x, value, bound, codes.OPTIMAL, by, int(found.nodes), start, spent)
         previous = np.zeros((1, self.controllers.size.blocks, self.controllers.size.mvs))
         if previous_moves is not None:
             previous[0, : self.structure.block_count] = previous_moves
         (result,) = finish_steps(
-            self.controllers.relaxer,
-            posed.instance,
-            Relaxations.of(posed.decision.root),
+            self.controllers.relaxers,
+            instance,
+            Relaxations.of(decision.root),
             previous_moves=previous,
             gap=gap,
             time_limit=time_limit,
@@ -235,9 +197,8 @@ class Planner:
         )
         return result
 
-    def _relaxed(self, posed: Posed, gap: float) -> SearchResult:
+    def _relaxed(self, instance: QpInstance, root: Relaxed, gap: float) -> SearchResult:
         """The problem without integers: one relaxation."""
-        instance, root = one_lane(posed.instance), one_lane(posed.decision.root)
         if not continuous_feasible(self.structure, self.controllers.size, instance):
             return SearchResult(None, np.inf, np.inf, codes.INFEASIBLE, None, 0)
         if not np.isfinite(root.warm.x).all():
@@ -246,7 +207,7 @@ class Planner:
         bound = min(max(float(root.bound), 0.0), value)
         closed = closes(value, bound, self._unit, gap)
         status, by = (codes.OPTIMAL, "relaxation") if closed else (codes.LIMIT, None)
-        return SearchResult(root.warm.x, value, bound, status, by, 1, root.warm)
+        return SearchResult(np.asarray(root.warm.x), value, bound, status, by, 1, root.warm)
 
     @functools.cached_property
     def _unit(self) -> float:
@@ -254,7 +215,7 @@ class Planner:
         return float(self.controllers.cores.shared.tables.scale)
 
     def _plan(
-        self, posed: Posed, result: SearchResult, mv_now, free_response, setpoint, gap, clock: Clock
+        self, instance: QpInstance, result: SearchResult, mv_now, free_response, setpoint, gap, clock: Clock
     ) -> Plan:
         if result.x is None:
             name, took = codes.STATUS[result.status], clock.seconds
@@ -262,7 +223,7 @@ class Planner:
         core, size = self.controllers.cores.shared, self.controllers.size
         x = np.array(result.x)
         x = np.where(np.asarray(core.qp.whole), np.round(x), x)
-        x = _repair(self.structure, size, one_lane(posed.instance), x)
+        x = _repair(self.structure, size, instance, x)
         moves = (x * np.asarray(core.qp.scale)).reshape(size.mvs, -1).T[: self.structure.block_count]
         objective, cv, eps = self.objective(moves, free_response, setpoint)
         bound = min(result.bound, objective)
@@ -288,12 +249,7 @@ class Planner:
     def objective(
         self, moves, free_response, setpoint
     ) -> tuple[float, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """(6.6) of a plan in engineering units, with its predictions and limit violations.
-
-        Args:
-            moves: ``"block mv"`` [MV unit].
-            free_response: Lambda, ``"horizon cv"``.
-            setpoint: r, ``"horizon cv"``.
+        """(6.6) of a plan ``"block mv"`` in engineering units, with its predictions and limit violations.
 
         Returns:
             ``(objective, cv, (eps_high, eps_low))``.
@@ -351,9 +307,6 @@ def solve_plan(
     """Solve one controller step.
 
     Args:
-        model: step-response model.
-        structure: static configuration.
-        tuning: weights and limits.
         mv_now: MVs before the move, ``"mv"`` [MV unit], within their limits.
         last_move: previous move, ``"mv"`` [MV unit]; oscillation rows use it rounded to whole steps.
         free_response: Lambda at j = 1..Hp with bias, ``"horizon cv"`` [CV unit].
@@ -363,41 +316,13 @@ def solve_plan(
         gap: relative gap at which the plan counts as optimal.
         finish: ``auto``, ``enumeration``, ``highs`` or ``branch-and-bound``.
 
-    Returns:
-        `Plan`.
-
     Raises:
         InputError: naming the field, for wrong shapes, NaN or an MV outside its limits.
     """
-    now = check_vector("mv_now", mv_now, structure.mv_names, "MV unit")
-    check_vector("last_move", last_move, structure.mv_names, "MV unit")
-    for path, value in (("free_response", free_response), ("setpoint", setpoint)):
-        array = np.asarray(value, dtype=np.float64)
-        expected = (structure.prediction_horizon, structure.cv_count)
-        if array.shape != expected or not sound(array).all():
-            raise InputError(
-                path,
-                f"shape {list(array.shape)}",
-                f"finite numbers of size {LARGEST:g} at most and of shape {list(expected)} [CV unit]",
-            )
-    low, high = np.asarray(tuning.mv_low), np.asarray(tuning.mv_high)
-    for i, name in enumerate(structure.mv_names):
-        drift = DRIFT * (structure.integer_step[i] or max(1.0, abs(now[i])))
-        if not low[i] - drift <= now[i] <= high[i] + drift:
-            raise InputError(f"mv_now[{i}]", now[i], f"between {low[i]} and {high[i]} [MV unit] for {name}")
-    if previous_moves is not None and np.shape(previous_moves) != (structure.block_count, structure.mv_count):
-        raise InputError(
-            "previous_moves",
-            f"shape {list(np.shape(previous_moves))}",
-            f"shape {[structure.block_count, structure.mv_count]}, block by MV",
-        )
-    return Planner(structure, tuning, model).solve(
-        mv_now=now,
-        last_move=last_move,
-        free_response=free_response,
-        setpoint=setpoint,
-        previous_moves=previous_moves,
-        time_limit=time_limit,
-        gap=gap,
-        finish=finish,
-    )
+    given = dict(mv_now=mv_now, last_move=last_move, free_response=free_response, setpoint=setpoint)
+    known: dict[str, Any] = {
+        path: step_array(path, value, structure)
+        for path, value in (given | {"previous_moves": previous_moves}).items()
+    }
+    check_position(structure, tuning, known["mv_now"])
+    return Planner(structure, tuning, model).solve(**known, time_limit=time_limit, gap=gap, finish=finish)

@@ -18,19 +18,12 @@ from jaxmpc.problem.structure import Structure
 
 
 class Sample(NamedTuple):
-    """What is known at a sample, the lane axis first where there are lanes.
+    """What is known at a sample, the lane axis first where there are lanes."""
 
-    Attributes:
-        cv: ``"cv"``, measured; not a number where nothing arrived [CV unit].
-        setpoint: ``"horizon cv"`` over the horizon, or ``"cv"`` held over it [CV unit].
-        mv: ``"mv"``, where the actuators stand; not a number where that is not known [MV unit].
-        manual: ``"mv"``, MVs that somebody else moves.
-    """
-
-    cv: Any
-    setpoint: Any
-    mv: Any
-    manual: Any
+    cv: Any  # ``"cv"``, measured; not a number where nothing arrived [CV unit]
+    setpoint: Any  # ``"horizon cv"`` over the horizon, or ``"cv"`` held over it [CV unit]
+    mv: Any  # ``"mv"``, where the actuators stand; not a number where that is not known [MV unit]
+    manual: Any  # ``"mv"``, MVs that somebody else moves
 
 
 def checked(

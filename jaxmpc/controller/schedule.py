@@ -27,13 +27,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxmpc.check import check_keys, is_count, is_number
 from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.controller.core import ControllerState, Core, Moment, StepInfo
 from jaxmpc.controller.sample import Sample
 from jaxmpc.errors import InputError
-from jaxmpc.files import write_atomically
+from jaxmpc.files import read_json, write_atomically
 from jaxmpc.model.step_response import StepResponseModel, advance_free_response, make_model
-from jaxmpc.problem.condense import condense, matrices_of
+from jaxmpc.problem.condense import matrices_of
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
 from jaxmpc.programs.clock import Clock
@@ -99,11 +100,7 @@ class ModelSchedule(eqx.Module):
     @classmethod
     def load(cls, path: str | Path) -> ModelSchedule:
         """Read a schedule written by `save`. Raises `InputError` naming the field that is wrong."""
-        try:
-            body = json.loads(Path(path).read_text())
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError("schedule file", str(path), f"a readable JSON file ({error})") from error
-        return cls.from_dict(body)
+        return cls.from_dict(read_json("schedule file", path))
 
     @classmethod
     def from_dict(cls, body: Any) -> ModelSchedule:
@@ -111,9 +108,7 @@ class ModelSchedule(eqx.Module):
         if not isinstance(body, dict):
             expected = "an object with dt, cv, mv, grid and coefficients"
             raise InputError("schedule", type(body).__name__, expected)
-        for key in ("dt", "cv", "mv", "grid", "coefficients"):
-            if key not in body:
-                raise InputError(f"schedule.{key}", "nothing", "a value (the key is missing)")
+        check_keys("schedule", body, ("dt", "cv", "mv", "grid", "coefficients"))
         names, grid = body["mv"], body["grid"]
         if not isinstance(grid, dict) or sorted(grid) != sorted(names):
             raise InputError("schedule.grid", grid, f"one list of values for each of {names}")
@@ -222,10 +217,8 @@ class ScheduledCore(Core):
         standing = self.locate(state, sample.mv, sample.manual).mv
         coefficients = _register(self.schedule, standing, self.size.future)
         matrices = matrices_of(self.layout, self.size, coefficients, summed=False)
-        levels, limits = self.qp.steep.shape[0], self.qp.has_limits
-        qp = condense(self.layout, self.size, self.tuning, matrices, envelope=levels, has_limits=limits)
-        scale = jnp.maximum(jnp.max(jnp.diagonal(qp.curvature)), 1e-12)
-        tables = eqx.tree_at(lambda t: t.scale, self.tables, scale)
+        qp = self.condensed(self.tuning, matrices)
+        tables = eqx.tree_at(lambda t: t.scale, self.tables, qp.unit)
         now = Core(self.layout, self.tuning, coefficients, qp, tables, self.size, self.switching)
         return now.consider(state, sample, gap, search)
 
@@ -238,19 +231,18 @@ class _Table:
     """Controllers with whole moves over the present MVs, made when first needed; steps like `Controllers` of one lane.
 
     Args:
-        controllers: with the schedule's reference model.
-        schedule: of step-response models.
         spacing: of the table in continuous MVs [MV unit]; integer MVs have one row per step.
         kept: controllers kept; the one used least recently goes first.
     """
 
     def __init__(self, controllers: Controllers, schedule: ModelSchedule, spacing: float, kept: int):
-        if not (np.isfinite(spacing) and spacing > 0):
+        if not is_number(spacing) or spacing <= 0:
             raise InputError("spacing", spacing, "a positive distance of models in the table [MV unit]")
-        if isinstance(kept, bool) or not isinstance(kept, int) or kept < 1:
+        if not is_count(kept):
             raise InputError("kept", kept, "a whole number of controllers, 1 or more")
         self.reference, self.schedule, self.spacing, self.kept = controllers, schedule, spacing, kept
         self.size, self.init, self.structure = controllers.size, controllers.init, controllers.structure
+        self.scenarios, self.count = controllers.scenarios, 1
         self.grid = np.array([step or spacing for step in self.structure.integer_step])
         self.built = 0  # controllers made so far
         self._table: collections.OrderedDict[tuple[float, ...], Controllers] = collections.OrderedDict()
@@ -295,9 +287,6 @@ class ScheduledController(Controller):
     table of controllers over the present MVs is kept.
 
     Args:
-        structure: static configuration.
-        tuning: weights and limits.
-        schedule: of step-response models.
         spacing: of the table in continuous MVs [MV unit].
         kept: controllers kept in the table.
         **options: ``gap``, ``time_limit`` and ``finish`` of `Controller`.

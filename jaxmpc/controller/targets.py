@@ -17,6 +17,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import ArrayLike, Bool, Float
 
+from jaxmpc.check import is_number
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.core import ControllerState, StepInfo
 from jaxmpc.controller.sample import checked, checked_start
@@ -40,9 +41,6 @@ def augment(
     its last value counts Hp - Hu + 1 times.
 
     Args:
-        structure: static configuration.
-        tuning: weights and limits, of one controller.
-        model: step-response model.
         target_weight: by MV name [1/MV unit^2], 0 or more; an MV that is not named gets no CV.
 
     Returns:
@@ -59,8 +57,7 @@ def augment(
             raise InputError(
                 f"target_weight.{name}", weight, f"one of the MV names {', '.join(structure.mv_names)}"
             )
-        number = isinstance(weight, (int, float, np.number)) and not isinstance(weight, bool)
-        if not number or not np.isfinite(weight) or weight < 0:
+        if not is_number(weight) or weight < 0:
             raise InputError(f"target_weight.{name}", weight, "a finite number, 0 or more [1/MV unit^2]")
     mvs = [i for i, name in enumerate(structure.mv_names) if name in target_weight]
     if not mvs:
@@ -102,11 +99,7 @@ class TargetController:
     Without integer MVs `step` is pure, as that of `Controller`.
 
     Args:
-        structure: static configuration, integer MVs or none.
-        tuning: weights and limits.
-        model: step-response model.
         target_weight: by MV name [1/MV unit^2]; see `augment`.
-        **options: of `Controller`.
 
     Attributes:
         structure: as given, without the further CVs.
@@ -143,7 +136,6 @@ class TargetController:
         """One sample; the objective in the info is J + J_u (6.20).
 
         Args:
-            state: from `init` or the previous step.
             cv: measurement now, without the further CVs [CV unit].
             setpoint: at j = 1..Hp, or held over the horizon [CV unit].
             mv_target: held over the horizon [MV unit]; entries of MVs without a target are not looked at.

@@ -184,7 +184,9 @@ class Search:
             own = steep[:, None] * np.maximum(np.abs(values) - knot, 0.0)
             excess += own - price[:, None] * values + (knot * np.abs(price))[:, None]
         value = float(result.bound[lane])
-        if len(result.position[lane]):  # complete the square: the same bound about another center of what is free
+        if len(
+            result.position[lane]
+        ):  # complete the square: the same bound about another center of what is free
             more, bend = c.of_chords(result.position[lane], center)
             step, free = np.zeros(len(center)), np.flatnonzero(upper > lower)
             own = c.schur[np.ix_(free, free)]

@@ -17,9 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxmpc import status as codes
-from jaxmpc.controller.controller import Controllers, considered, said_of
-from jaxmpc.controller.core import Core, Moment
+from jaxmpc.controller.controller import Batch, considered
+from jaxmpc.controller.core import Moment
 from jaxmpc.controller.measurement import received
 from jaxmpc.controller.sample import Sample
 from jaxmpc.programs.clock import Clock
@@ -27,7 +26,7 @@ from jaxmpc.programs.compilation import compiling_for
 from jaxmpc.programs.lanes import Lanes
 from jaxmpc.programs.packing import Packing, flattened, rebuilt
 from jaxmpc.programs.threads import parts_of, side_by_side
-from jaxmpc.relaxed.gap import FINEST, relative_gap
+from jaxmpc.relaxed.gap import FINEST
 
 LONGEST = 64  # samples of one call
 TOGETHER = 16  # scenarios of one call, on a CPU
@@ -35,74 +34,29 @@ APART = 5  # Newton steps that take as long as the rest of a sample
 
 
 class Now(NamedTuple):
-    """A sample whose measurement is known; all arrays with a scenario axis.
+    """A sample whose measurement is known; all arrays with a scenario axis."""
 
-    Attributes:
-        moment: of the controllers, after the measurement.
-        plant: state of the plant.
-        cv: measured by sensors without fault.
-        mv: where the actuators stand.
-        x: the plan, scaled.
-        good: whether there is one.
-        decided: whether `x` and `good` are known.
-    """
-
-    moment: Moment
-    plant: Any
-    cv: Float[Array, "scenario cv"]
-    mv: Float[Array, "scenario mv"]
-    x: Float[Array, "scenario n"]
-    good: Bool[Array, " scenario"]
-    decided: Bool[Array, " scenario"]
-
-
-class Seen(NamedTuple):
-    """What is kept of a measured sample: fields of `Trajectory`, and the steps that its solves took."""
-
-    cv: Array
-    bias: Array
-    bias_raw: Array
-    quality: Array
-    off: Array
-    status: Array
-    fallback: Array
-    objective: Array
-    bound: Array
-    gap: Array
-    nodes: Array
-    finished_by: Array
-    steps: Array
-
-
-class Done(NamedTuple):
-    """What is kept of a sample that was carried out."""
-
-    mv_demand: Array
-    mv: Array
-    move: Array
-    plan: Array
+    moment: Moment  # of the controllers, after the measurement
+    plant: Any  # state of the plant
+    cv: Float[Array, "scenario cv"]  # measured by sensors without fault
+    mv: Float[Array, "scenario mv"]  # where the actuators stand
+    x: Float[Array, "scenario n"]  # the plan, scaled
+    good: Bool[Array, " scenario"]  # whether there is one
+    decided: Bool[Array, " scenario"]  # whether `x` and `good` are known
 
 
 class Inputs(NamedTuple):
-    """What comes from outside, of all scenarios.
+    """What comes from outside, of all scenarios."""
 
-    Attributes:
-        setpoints: ``"scenario sample cv"`` [CV unit].
-        disturbance: ``"scenario sample"``.
-        errors: noise of the sensors, ``"scenario sample cv"`` [CV unit].
-        faults: of the sensors, as of `measurement.fault_errors`.
-        told: ``"scenario"``, whether the controller is told where the actuators stand.
-    """
-
-    setpoints: np.ndarray
-    disturbance: np.ndarray
-    errors: np.ndarray
-    faults: np.ndarray
-    told: np.ndarray
+    setpoints: np.ndarray  # ``"scenario sample cv"`` [CV unit]
+    disturbance: np.ndarray  # ``"scenario sample"``
+    errors: np.ndarray  # noise of the sensors, ``"scenario sample cv"`` [CV unit]
+    faults: np.ndarray  # of the sensors, as of `measurement.fault_errors`
+    told: np.ndarray  # ``"scenario"``, whether the controller is told where the actuators stand
 
 
 def simulate_compiled(
-    controllers: Controllers,
+    controllers: Batch,
     plants: Lanes,
     inputs: Inputs,
     record: Collection[str],
@@ -116,10 +70,6 @@ def simulate_compiled(
     The samples of a call share its time by the steps of their solves; what the host does is charged to its sample.
 
     Args:
-        controllers: one per scenario.
-        plants: one plant for all, or one per scenario.
-        inputs: what comes from outside.
-        record: fields to keep.
         real: number of scenarios that count, the others are copies; all if not given.
         devices: to spread the scenarios over; the default one if not given.
         progress: told how many samples of all scenarios were done, first when everything is compiled; by one thread at a
@@ -135,8 +85,8 @@ def simulate_compiled(
         for part, place in zip(parts, places, strict=True)
     ]
     with compiling_for(f"loops of {controllers.size}"):
-        stages = [run.start() for run in runs]
-        runs[0].stride(stages[0], 0)
+        starts = [run.start() for run in runs]
+        runs[0].stride(starts[0], 0)
     own = [min(max(real - int(part[0]), 0), len(part)) for part in parts]
 
     def tick(samples: int) -> None:
@@ -145,7 +95,7 @@ def simulate_compiled(
                 progress(samples)
 
     def advance(k: int, stopped: Callable[[], bool]) -> dict[str, np.ndarray]:
-        fields = runs[k].advanced(stages[k], lambda samples: tick(own[k] * samples), stopped)
+        fields = runs[k].advanced(starts[k], lambda samples: tick(own[k] * samples), stopped)
         return {name: values[: own[k]] for name, values in fields.items()}
 
     tick(0)
@@ -155,18 +105,11 @@ def simulate_compiled(
     return {name: np.concatenate([f.pop(name) for f in fields]) for name in list(fields[0])}
 
 
-class _Stage(NamedTuple):
-    """A packed sample, on the device or the host, and whether all of it is decided."""
-
-    packed: Any
-    decided: bool
-
-
 class _Run:
     """Loops under way, of scenarios that share every call; arguments as in `simulate_compiled`."""
 
     def __init__(
-        self, controllers: Controllers, plants: Lanes, inputs: Inputs, record: Collection[str], place: Any
+        self, controllers: Batch, plants: Lanes, inputs: Inputs, record: Collection[str], place: Any
     ):
         self.controllers, self.plants, self.record, self.place = controllers, plants, record, place
         self.count, self.samples = controllers.count, inputs.setpoints.shape[1]
@@ -180,8 +123,8 @@ class _Run:
         search = np.full(self.count, float(controllers.searching))
         self.settings = np.stack([gap, search, inputs.told.astype(float)], axis=1)
 
-    def start(self) -> _Stage:
-        """Before the first sample."""
+    def start(self) -> Any:
+        """The packed `Now` before the first sample."""
         c = self.controllers
         plant_state, outputs = self._steady()
         state, mv = c.init(outputs.cv, outputs.mv), outputs.mv
@@ -194,7 +137,7 @@ class _Run:
         no: Any = np.zeros(self.count, dtype=bool)
         now = Now(moment, plant_state, cv, mv, np.zeros_like(moment.decision.x), no, no)
         self.of_now = Packing.of(now)
-        return _Stage(self.of_now.pack(now), False)
+        return self.of_now.pack(now)
 
     def _steady(self) -> tuple[Any, Any]:
         """Steady states of the plants, and what they measure there."""
@@ -205,42 +148,40 @@ class _Run:
         lanes = lambda v: np.broadcast_to(v, (self.count, *np.shape(v)))  # noqa: E731
         return jax.tree.map(lanes, (state, plant.measure(state)))
 
-    def stride(self, stage: _Stage, begin: int) -> tuple[_Stage, Seen, Done, int]:
+    def stride(self, packed: Any, begin: int) -> tuple[Any, dict, dict, int, bool]:
         """Carry out sample `begin` if it is decided, and go on up to one that is not.
 
         Returns:
-            ``(stage, seen, done, count)``: the sample measured last, what was measured since, what was carried out, and how
-            many samples were measured.
+            ``(packed, seen, done, count, decided)``: the sample measured last, fields of what was measured since and of what
+            was carried out, how many samples were measured, and whether all scenarios of the last one are decided.
         """
-        now = self.inputs[:, begin : begin + LONGEST + 1]
-        given = (stage.packed, now, self.settings)
+        given = (packed, self.inputs[:, begin : begin + LONGEST + 1], self.settings)
         given = given if self.place is None else jax.device_put(given, self.place)
-        packed, (seen, done), (count, decided) = _stride(self.leaves, *given, self.form, self.of_now)
-        rows = lambda tree: jax.tree.map(np.asarray, tree)  # noqa: E731
-        return _Stage(packed, bool(decided)), rows(seen), rows(done), int(count)
+        packed, rows, (count, decided) = _stride(self.leaves, *given, self.form, self.of_now)
+        seen, done = jax.tree.map(np.asarray, rows)
+        return packed, seen, done, int(count), bool(decided)
 
     def advanced(
-        self, stage: _Stage, tick: Callable[[int], None], stopped: Callable[[], bool]
+        self, packed: Any, tick: Callable[[int], None], stopped: Callable[[], bool]
     ) -> dict[str, np.ndarray]:
         """The whole run."""
         fields: dict[str, np.ndarray] = {}
-        done = 0
+        done = acted = 0  # only the first call has nothing to carry out
         while done < self.samples and not stopped():
             clock = Clock()
-            acted = int(stage.decided)  # only the first call has nothing to carry out
-            stage, seen, doings, count = self.stride(stage, done)
+            packed, seen, doings, count, decided = self.stride(packed, done)
             seconds = clock.seconds
             # the first row of what was seen is the sample after the one that was carried out first
-            first, carried = done + acted, count - 1 + acted
-            for name, values in doings._asdict().items():
+            first, carried, acted = done + acted, count - 1 + acted, 1
+            for name, values in doings.items():
                 self._put(fields, name, done, values[:, :carried])
-            work = seen.steps[:, :count] + APART
-            shares = {"solve_time": seconds * work / work.sum()}
-            for name, values in (seen._asdict() | shares).items():
-                self._put(fields, name, first, np.asarray(values[:, :count]))
+            work = seen["steps"][:, :count] + APART
+            seen["solve_time"] = seconds * work / work.sum()
+            for name, values in seen.items():
+                self._put(fields, name, first, values[:, :count])
             before, done = done, done + carried
-            if done < self.samples and not stage.decided:
-                stage = self._decide(stage, fields, done)
+            if done < self.samples and not decided:
+                packed = self._decide(packed, fields, done)
             if carried:
                 tick(min(done, self.samples) - before)
         return fields
@@ -253,34 +194,25 @@ class _Run:
             fields[name] = np.empty((len(values), self.samples, *values.shape[2:]), dtype=values.dtype)
         fields[name][:, begin : begin + values.shape[1]] = values[:, : max(self.samples - begin, 0)]
 
-    def _decide(self, stage: _Stage, fields: dict[str, np.ndarray], at: int) -> _Stage:
+    def _decide(self, packed: Any, fields: dict[str, np.ndarray], at: int) -> Any:
         """Decide sample `at` outside the stride, and record how."""
-        now: Now = self.of_now.unpack(np.array(stage.packed))
+        now: Now = self.of_now.unpack(np.array(packed))
         which = np.flatnonzero(~now.decided)
-        results = self.controllers.finish_open(now.moment, which, np.zeros(self.count))
-        x, good = now.x.copy(), now.good.copy()
-        for i, result in zip(which, results, strict=True):
-            good[i] = result.x is not None
-            said = said_of(result, float(now.moment.unit[i]))
-            for name in said.keys() & fields.keys():
-                fields[name][i, at] = said[name]
-            if "solve_time" in fields:
-                fields["solve_time"][i, at] += result.seconds
-            if result.x is not None:
-                x[i] = result.x
-        self.controllers.decided = True
+        x, good, said = self.controllers.finish_open(now.moment, which, np.zeros(len(which)))
+        for name in said.keys() & fields.keys():
+            before = fields[name][which, at] if name == "solve_time" else 0
+            fields[name][which, at] = before + said[name]
         decided: Any = np.ones(self.count, dtype=bool)
-        return _Stage(self.of_now.pack(now._replace(x=x, good=good, decided=decided)), True)
+        return self.of_now.pack(now._replace(x=x, good=good, decided=decided))
 
 
 @eqx.filter_jit
 def _steady(plants: Lanes):
-    def lane(own):
-        plant = eqx.combine(own, plants.shared)
+    def lane(plant):
         state = plant.init()
         return state, plant.measure(state)
 
-    return jax.vmap(lane)(plants.each)
+    return plants.vmap(lane)
 
 
 @functools.partial(jax.jit, static_argnames=("form", "of_now"))
@@ -288,82 +220,55 @@ def _stride(leaves, packed, inputs, settings, form, of_now: Packing):
     """See `_Run.stride`."""
     cores, plants = rebuilt(form, leaves)
     now: Now = of_now.unpack(packed)
-    cvs, mvs, future = now.cv.shape[1], now.mv.shape[1], now.moment.free_response.shape[1]
+    cvs, future = now.cv.shape[1], now.moment.free_response.shape[1]
     setpoints, errors, faults = (inputs[..., k * cvs : (k + 1) * cvs] for k in range(3))
     disturbance, told = inputs[..., -1], settings[:, 2:] > 0
     late = now.decided[0].astype(int)  # measured is sample `late`, then late + 1, ...
 
-    def carry_out(now: Now, at) -> tuple[Now, Done]:
-        def plan(own, moment, x, good):
-            core: Core = eqx.combine(own, cores.shared)
-            return core.carry_out(moment, x, good)
-
-        state, moves = jax.vmap(plan)(cores.each, now.moment, now.x, now.good)
-
-        def advance(own, plant_state, mv, offset):
-            return eqx.combine(own, plants.shared).step(plant_state, mv, offset)
-
-        plant_state, outputs = jax.vmap(advance)(plants.each, now.plant, state.mv, disturbance[:, at])
+    def carry_out(now: Now, at) -> tuple[Now, dict[str, Array]]:
+        state, moves = cores.vmap(lambda core, *plan: core.carry_out(*plan), now.moment, now.x, now.good)
+        advance = lambda plant, *given: plant.step(*given)  # noqa: E731
+        plant_state, outputs = plants.vmap(advance, now.plant, state.mv, disturbance[:, at])
         now = now._replace(
             moment=now.moment._replace(state=state),
             plant=plant_state,
             cv=outputs.cv + errors[:, at + 1],
             mv=outputs.mv,
         )
-        return now, Done(state.mv, outputs.mv, moves[:, 0], moves)
+        return now, dict(mv_demand=state.mv, mv=outputs.mv, move=moves[:, 0], plan=moves)
+
+    def measure(now: Now, at) -> tuple[Now, dict[str, Array]]:
+        before = now.moment.state
+        sample = Sample(
+            cv=received(now.cv, faults[:, at], before.sensors.value),
+            setpoint=jnp.broadcast_to(setpoints[:, at, None], (now.cv.shape[0], future, cvs)),
+            mv=jnp.where(told, now.mv, jnp.nan),
+            manual=jnp.zeros(now.mv.shape, dtype=bool),
+        )
+        moment = considered(cores, before, sample, settings[:, :2])
+        found, state, whole = moment.decision, moment.state, cores.value.tables.count > 0
+        own = dict(cv=now.cv, bias=state.bias, bias_raw=state.bias_raw, steps=found.steps)
+        now = now._replace(moment=moment, x=found.x, good=moment.good, decided=moment.good | ~whole)
+        return now, own | moment.said(whole)
 
     def forward(carry):
         now, seen, done, count = carry
         at = late + count - 1  # sample to carry out; -1 for none
-        nothing = Done(now.mv, now.mv, now.mv, now.moment.state.plan)
         now, did = jax.lax.cond(
             at >= 0, lambda: carry_out(now, at), lambda: (now, jax.tree.map(jnp.zeros_like, nothing))
         )
         row = jnp.where(at >= 0, at, LONGEST + 1)  # out of range: not written
         done = jax.tree.map(lambda rows, new: rows.at[:, row].set(new, mode="drop"), done, did)
-        before = now.moment.state
-        held = jnp.broadcast_to(setpoints[:, at + 1, None], (now.cv.shape[0], future, cvs))
-        sample = Sample(
-            cv=received(now.cv, faults[:, at + 1], before.sensors.value),
-            setpoint=held,
-            mv=jnp.where(told, now.mv, jnp.nan),
-            manual=jnp.zeros(now.mv.shape, dtype=bool),
-        )
-        moment = considered(cores, before, sample, settings[:, :2])
-        found, state = moment.decision, moment.state
-        good = found.closed & jnp.isfinite(found.x).all(axis=1)
-        whole = cores.value.tables.count > 0
-        decided = good | ~whole
-        certified = lambda value: jnp.where(good, value, jnp.nan)  # noqa: E731
-        kept = Seen(
-            cv=now.cv,
-            bias=state.bias,
-            bias_raw=state.bias_raw,
-            quality=state.sensors.quality,
-            off=state.sensors.off,
-            status=jnp.where(good, codes.OPTIMAL, codes.FAILED),
-            fallback=~good,
-            objective=certified(found.value),
-            bound=certified(found.bound),
-            gap=certified(relative_gap(found.value, found.bound, moment.unit)),
-            nodes=jnp.where(whole, found.nodes, found.steps),
-            finished_by=jnp.where(good, found.finished_by, 0),
-            steps=found.steps,
-        )
+        now, kept = measure(now, at + 1)
         seen = jax.tree.map(lambda rows, new: rows.at[:, count].set(new), seen, kept)
-        return now._replace(moment=moment, x=found.x, good=good, decided=decided), seen, done, count + 1
+        return now, seen, done, count + 1
 
     def onward(carry):
         now, *_, count = carry
         return (count == 0) | (now.decided.all() & (count < LONGEST))
 
-    table = lambda *shape, dtype=float: jnp.zeros((now.cv.shape[0], LONGEST + 1, *shape), dtype=dtype)  # noqa: E731
-    whole, flag = (functools.partial(table, dtype=kind) for kind in (int, bool))
-    numbers = table(), table(), table()
-    seen = Seen(
-        *(table(cvs), table(cvs), table(cvs), whole(cvs), flag(cvs)),
-        *(whole(), flag(), *numbers, whole(), whole(), whole()),
-    )
-    done = Done(table(mvs), table(mvs), table(mvs), table(*now.moment.state.plan.shape[1:]))
+    table = lambda v: jnp.zeros((v.shape[0], LONGEST + 1, *v.shape[1:]), v.dtype)  # noqa: E731
+    nothing = dict(mv_demand=now.mv, mv=now.mv, move=now.mv, plan=now.moment.state.plan)
+    seen, done = jax.tree.map(table, (jax.eval_shape(measure, now, 0)[1], nothing))
     now, seen, done, count = jax.lax.while_loop(onward, forward, (now, seen, done, 0))
     return of_now.pack(now), (seen, done), (count, now.decided.all())

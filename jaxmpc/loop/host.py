@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import gc
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -32,8 +33,6 @@ def simulate_on_host(
     """One closed loop; fields of `Trajectory`.
 
     Args:
-        plant: with `init()` and `step(mv, disturbance)`.
-        inputs: of one scenario.
         takeovers: controllers by the first sample that they decide.
         blind: sample whose plan is carried out without feedback; None for none.
         progress: called with ``(done, total)`` samples.
@@ -79,22 +78,9 @@ def _sample(cv: np.ndarray, setpoint: np.ndarray, mv: np.ndarray) -> Sample:
 
 def _record(cv: np.ndarray, state: ControllerState, info: StepInfo) -> dict[str, Any]:
     """What a sample leaves behind, by the names of `Trajectory`."""
-    found = dict(
-        mv_demand=info.mv,
-        move=info.move,
-        plan=info.moves,
-        bias=state.bias,
-        bias_raw=state.bias_raw,
-        quality=info.quality,
-        off=info.off,
-        status=info.status,
-        fallback=info.fallback,
-        objective=info.objective,
-        bound=info.bound,
-        gap=info.gap,
-        nodes=info.nodes,
-        finished_by=info.finished_by,
-        solve_time=info.solve_time,
+    found = {f.name: getattr(info, f.name) for f in dataclasses.fields(info) if f.name != "recovering"}
+    found |= dict(
+        mv_demand=found.pop("mv"), plan=found.pop("moves"), bias=state.bias, bias_raw=state.bias_raw
     )
     return {"cv": cv} | {name: np.asarray(value)[0] for name, value in found.items()}
 

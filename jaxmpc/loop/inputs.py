@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.controller import Batch
 from jaxmpc.errors import InputError
 from jaxmpc.loop.compiled import Inputs
 from jaxmpc.loop.noise import check_deviation, check_seed, errors_of
@@ -20,45 +20,11 @@ from jaxmpc.process.plant import WellPlant
 from jaxmpc.programs.lanes import Lanes, for_all
 
 
-def check_match(structure: Structure, plant) -> None:
-    """Refuse a plant whose sampling interval is not the controller's."""
-    if abs(plant.dt - structure.dt) > 1e-9 * structure.dt:
-        raise InputError("plant.dt", plant.dt, f"the controller's sampling interval {structure.dt} s")
-
-
-def sampled(reference: Reference, structure: Structure, samples: int | None) -> np.ndarray:
-    """Setpoints ``"sample cv"`` of a run, refused where the reference does not fit."""
-    if reference.cv_count != structure.cv_count:
-        raise InputError(
-            "reference.setpoints",
-            f"{reference.cv_count} columns",
-            f"one per CV: {', '.join(structure.cv_names)}",
-        )
-    return reference.sample(structure.dt, samples)
-
-
-def check_offsets(offsets: np.ndarray, *shapes: tuple[int, ...]) -> None:
-    """Refuse pressure offsets [bar] of another shape, and those that are not finite."""
-    if offsets.shape not in shapes or not np.isfinite(offsets).all():
-        raise InputError(
-            "disturbance",
-            f"shape {list(offsets.shape)}",
-            f"{' or '.join(str(list(shape)) for shape in shapes)} finite offsets [bar], one per sample",
-        )
-
-
-def check_faults(faults: np.ndarray, *shapes: tuple[int, ...]) -> None:
-    """Refuse errors of sensors [CV unit] of another shape."""
-    if faults.shape not in shapes:
-        expected = " or ".join(str(list(shape)) for shape in shapes)
-        raise InputError("faults", f"shape {list(faults.shape)}", f"{expected} errors, one per sample and CV")
-
-
 @dataclasses.dataclass(frozen=True)
 class Sweep:
     """All lanes of a sweep on the host, checked."""
 
-    controllers: Controllers
+    controllers: Batch
     plants: Lanes[WellPlant]
     setpoints: Sequence[np.ndarray]  # one for all, or one per lane
     offsets: np.ndarray  # "sample" or "lane sample"
@@ -79,22 +45,21 @@ class Sweep:
         cls, controllers, plants, reference, samples, disturbance, noise, seed, faults, position_feedback
     ) -> Sweep:
         """The sweep, or an `InputError` that names what does not fit."""
-        if isinstance(controllers, Controller):
-            controllers = controllers.lanes
-        if not isinstance(controllers, Controllers):
-            raise InputError(
-                "controllers", type(controllers).__name__, "Controllers, or a Controller for all"
-            )
         plants = plants if isinstance(plants, Lanes) else for_all(plants)
         structure = controllers.structure
-        check_match(structure, plants.shared)
+        if abs(plants.shared.dt - structure.dt) > 1e-9 * structure.dt:
+            expected = f"the controller's sampling interval {structure.dt} s"
+            raise InputError("plant.dt", plants.shared.dt, expected)
         own_references = not isinstance(reference, Reference)
         references = list(reference) if own_references else [reference]
         if samples is None and references:
             samples = min(r.samples(structure.dt) for r in references)
-        setpoints = [sampled(r, structure, samples) for r in dict.fromkeys(references)]
-        by_reference = dict(zip(dict.fromkeys(references), setpoints, strict=True))
-        setpoints = [by_reference[r] for r in references]
+        for r in references:
+            if r.cv_count != structure.cv_count:
+                expected = f"one per CV: {', '.join(structure.cv_names)}"
+                raise InputError("reference.setpoints", f"{r.cv_count} columns", expected)
+        known = {r: r.sample(structure.dt, samples) for r in dict.fromkeys(references)}
+        setpoints = [known[r] for r in references]
         offsets = np.zeros(samples or 0) if disturbance is None else np.asarray(disturbance, dtype=np.float64)
         shape = (samples or 0, structure.cv_count)
         failing = np.zeros(shape) if faults is None else np.asarray(faults, dtype=np.float64)
@@ -120,8 +85,14 @@ class Sweep:
                 "lanes", given or "none", "one number of lanes, 1 or more, in all that has lanes"
             )
         count = next(iter(given.values()))
-        check_offsets(offsets, (len(setpoints[0]),), (count, len(setpoints[0])))
-        check_faults(failing, setpoints[0].shape, (count, *setpoints[0].shape))
+        shapes = (len(setpoints[0]),), (count, len(setpoints[0]))
+        if offsets.shape not in shapes or not np.isfinite(offsets).all():
+            expected = " or ".join(str(list(s)) for s in shapes) + " finite offsets [bar], one per sample"
+            raise InputError("disturbance", f"shape {list(offsets.shape)}", expected)
+        shapes = setpoints[0].shape, (count, *setpoints[0].shape)
+        if failing.shape not in shapes:
+            expected = " or ".join(str(list(s)) for s in shapes) + " errors, one per sample and CV"
+            raise InputError("faults", f"shape {list(failing.shape)}", expected)
         stream = np.arange(count) if seed.ndim == 0 else np.zeros(count)
         return cls(
             controllers=controllers,
@@ -136,7 +107,7 @@ class Sweep:
             count=count,
         )
 
-    def controllers_of(self, index: np.ndarray) -> Controllers:
+    def controllers_of(self, index: np.ndarray) -> Batch:
         """The controllers of some lanes."""
         if self.controllers.count == 1:
             return self.controllers.repeated(len(index))

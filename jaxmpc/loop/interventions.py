@@ -1,5 +1,5 @@
 """What may happen to a controller during a run: others take over from it (thesis 7.2.4), or its plan is carried out to
-its end without a look at the well (thesis 7.2.3). `closed_loop.simulate` is the only caller.
+its end without a look at the well (thesis 7.2.3). `loop.simulate` is the only caller.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from jaxmpc.check import is_number
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.core import ControllerState
 from jaxmpc.errors import InputError
@@ -22,11 +23,6 @@ def checked_changes(
     controller: Controller, changes: Sequence[tuple[float, Controller]], samples: int
 ) -> dict[int, Controller]:
     """Controllers that take over by the first sample they decide.
-
-    Args:
-        controller: the one that the run starts with.
-        changes: times [s] and controllers.
-        samples: length of the run.
 
     Raises:
         InputError: naming the entry, for times that do not increase or are outside the run, and for controllers whose
@@ -58,8 +54,7 @@ def checked_changes(
 
 def checked_sample(field: str, time: Any, structure: Structure, samples: int) -> int:
     """The first sample at or after a time [s] inside the run, or an `InputError` that names the field."""
-    good = isinstance(time, (int, float, np.number)) and not isinstance(time, bool) and np.isfinite(time)
-    sample = int(np.ceil(time / structure.dt - 1e-9)) if good else -1
+    sample = int(np.ceil(time / structure.dt - 1e-9)) if is_number(time) else -1
     if not 0 <= sample < samples:
         last = (samples - 1) * structure.dt
         raise InputError(field, time, f"a time from 0 to {last:g} s, the last sample of the run")
@@ -67,12 +62,7 @@ def checked_sample(field: str, time: Any, structure: Structure, samples: int) ->
 
 
 def handed_over(state: ControllerState, fresh: ControllerState) -> ControllerState:
-    """The state for a controller that takes over: all of it, but for a start of its solver that does not fit.
-
-    Args:
-        state: of the controller that ends.
-        fresh: initial state of the one that takes over.
-    """
+    """The state for a controller that takes over: all of it, but for a start of its solver that does not fit."""
     shapes = [[np.shape(leaf) for leaf in jax.tree.leaves(s.warm)] for s in (state, fresh)]
     return state if shapes[0] == shapes[1] else eqx.tree_at(lambda s: s.warm, state, fresh.warm)
 

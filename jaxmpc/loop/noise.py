@@ -24,7 +24,6 @@ def noise_samples(
     Args:
         deviation: standard deviation of every CV [CV unit].
         seed, stream: together they name one sequence of noise.
-        samples: numbers of the samples.
     """
     key = jax.random.fold_in(jax.random.key(seed), stream)
     draw = lambda k: jax.random.normal(jax.random.fold_in(key, k), deviation.shape)  # noqa: E731
@@ -37,7 +36,6 @@ def errors_of(deviation: np.ndarray, seeds: np.ndarray, samples: int) -> np.ndar
     Args:
         deviation: standard deviations ``"lane cv"`` [CV unit].
         seeds: seeds with streams ``"lane 2"``.
-        samples: length of the runs.
     """
     if not deviation.any():
         return np.zeros((len(deviation), samples, deviation.shape[1]))

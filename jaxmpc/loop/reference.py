@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxmpc.check import as_floats, is_number
 from jaxmpc.errors import InputError
 
 
@@ -55,7 +56,7 @@ class Reference:
                 f"reference.times[{i}]", times[i], f"a time after the change before it, {times[i - 1]:g} s"
             )
         duration = self.duration
-        if isinstance(duration, bool) or not isinstance(duration, (int, float)) or not np.isfinite(duration):
+        if not is_number(duration):
             raise InputError("reference.duration", duration, "a finite length of the run [s]")
         if duration <= times[-1]:
             raise InputError(
@@ -82,16 +83,12 @@ class Reference:
 
     def samples(self, dt: float) -> int:
         """Whole samples of `dt` [s] in the run."""
-        if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not np.isfinite(dt) or dt <= 0:
+        if not is_number(dt) or dt <= 0:
             raise InputError("dt", dt, "a positive sampling interval [s]")
         return int(np.floor(self.duration / dt + 1e-9))
 
     def window(self, dt: float, samples: int | None = None) -> np.ndarray:
         """Index of the setpoint row at each sample, ``"sample"``: the last change at or before k dt.
-
-        Args:
-            dt: sampling interval [s].
-            samples: how many; the whole run if not given.
 
         Raises:
             InputError: if the run is shorter than `samples`.
@@ -114,10 +111,7 @@ class Reference:
 
 def _numbers(field: str, given, dimensions: int, expected: str) -> np.ndarray:
     """A finite float array of so many dimensions, or an InputError that names the first bad entry."""
-    try:
-        array = np.array(given, dtype=np.float64)
-    except (ValueError, TypeError):
-        raise InputError(field, given, f"{expected}, rows of equal length") from None
+    array = as_floats(field, given, f"{expected}, rows of equal length")
     if array.ndim != dimensions:
         raise InputError(field, f"shape {list(array.shape)}", f"{dimensions} dimensions: {expected}")
     bad = np.argwhere(~np.isfinite(array))

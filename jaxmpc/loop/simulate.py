@@ -14,13 +14,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.controller import Batch, Controller, Controllers
 from jaxmpc.errors import InputError
 from jaxmpc.loop.compiled import Inputs, simulate_compiled
 from jaxmpc.loop.host import simulate_on_host
-from jaxmpc.loop.inputs import Sweep, check_faults, check_match, check_offsets, sampled
+from jaxmpc.loop.inputs import Sweep
 from jaxmpc.loop.interventions import checked_changes, checked_sample
-from jaxmpc.loop.noise import check_deviation, check_seed, errors_of
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.trajectory import RECORDABLE, Trajectory, TrajectoryBatch
 from jaxmpc.problem.structure import Structure
@@ -52,13 +51,11 @@ def simulate(
     """Close the loop from the plant's steady state at its default working point.
 
     Args:
-        controller: with whole moves or without.
         plant: `WellPlant`, or a stateful plant with `init()`, `step(mv, disturbance)` and `dt`, such as the FMU's.
         reference: setpoints, covering the run.
         samples: length of the run; the whole reference if not given.
         disturbance: reservoir-pressure offset per sample [bar], ``"sample"``; none if not given.
         noise: standard deviation of the measurement noise, ``"cv"`` [CV unit]; none if not given.
-        seed: of the noise.
         faults: errors of failing sensors ``"sample cv"``, from `measurement.fault_errors`; none if not given.
         position_feedback: whether the controller is told where the actuators stand, and predicts from there.
         changes: times [s] and controllers of equal structure that take over then, with the state of the one before.
@@ -76,18 +73,20 @@ def simulate(
             sample and CV, or a change does not fit.
     """
     structure = controller.structure
-    check_match(structure, plant)
-    setpoints = sampled(reference, structure, samples)
-    offsets = np.zeros(len(setpoints)) if disturbance is None else np.asarray(disturbance, dtype=np.float64)
-    check_offsets(offsets, (len(setpoints),))
-    deviation, stream = check_deviation(noise, structure.cv_count), check_seed(seed)
-    if deviation.ndim > 1 or stream.ndim:
+    if (noise is not None and np.ndim(noise) > 1) or np.ndim(seed):
         raise InputError("noise", noise, "one standard deviation per CV and one seed, for one run")
-    errors = errors_of(deviation[None], np.array([[int(stream), 0]]), len(setpoints))
-    failing = np.zeros_like(setpoints) if faults is None else np.asarray(faults, dtype=np.float64)
-    check_faults(failing, setpoints.shape)
-    told = np.array([bool(position_feedback)])
-    inputs = Inputs(setpoints[None], offsets[None], errors, failing[None], told)
+    run = Sweep.checked(
+        controller.lanes,
+        plant,
+        [reference],
+        samples,
+        disturbance,
+        noise,
+        seed,
+        faults,
+        bool(position_feedback),
+    )
+    setpoints, inputs = run.setpoints[0], run.inputs_of(np.arange(1))
     takeovers, blind = checked_changes(controller, changes, len(setpoints)), None
     if open_loop_from is not None:
         blind = checked_sample("open_loop_from", open_loop_from, structure, len(setpoints))
@@ -103,7 +102,7 @@ def simulate(
     return Trajectory(setpoint=setpoints, **record, **kept, **_labels(structure, len(setpoints)))
 
 
-def _one_lane(controllers: Controllers, plant, inputs: Inputs, record, progress: Progress | None):
+def _one_lane(controllers: Batch, plant, inputs: Inputs, record, progress: Progress | None):
     """A compiled loop of one controller."""
     done, total = 0, inputs.setpoints.shape[1]
 
@@ -180,14 +179,14 @@ def simulate_batches(
         devices: to spread the lanes over; all of this process if not given.
         progress: called with ``(done, total)`` samples of all lanes, first when compilation is over.
 
-    Returns:
-        Iterator of `TrajectoryBatch`, in lane order.
-
     Raises:
         InputError: at once, for what `simulate` refuses, lane counts that differ, or no lanes at all.
     """
+    lanes = controllers.lanes if isinstance(controllers, Controller) else controllers
+    if not isinstance(lanes, Batch):
+        raise InputError("controllers", type(lanes).__name__, "Controllers, or a Controller for all")
     sweep = Sweep.checked(
-        controllers, plants, reference, samples, disturbance, noise, seed, faults, position_feedback
+        lanes, plants, reference, samples, disturbance, noise, seed, faults, position_feedback
     )
     unknown = [field for field in record if field not in RECORDABLE]
     if unknown:

@@ -30,13 +30,10 @@ def simulate_with_targets(
     """Close the loop with setpoints for the CVs and targets for the MVs.
 
     Args:
-        controller: with the targets' weights.
-        plant: as in `jaxmpc.simulate`.
         reference: setpoints, one column per CV.
         mv_target: targets over time, one column per MV; columns of MVs without a target are not looked at.
         noise: standard deviation of the measurement noise, ``"cv"`` [CV unit]; demands are known without noise.
         faults, position_feedback: as in `jaxmpc.simulate`, for the plant's own CVs.
-        **options: of `jaxmpc.simulate`.
 
     Returns:
         `Trajectory` of the plant's own CVs; `setpoint` has those of `reference`. Its objective is J + J_u (6.20).

@@ -122,11 +122,7 @@ class TrajectoryBatch:
 
     Attributes:
         lanes: ``"lane"``, which lanes of the whole sweep these are.
-        time: ``"sample"``, start of each sample [s].
-        setpoint: ``"lane sample cv"`` [CV unit].
-        fields: the recorded fields of `Trajectory` by name, each with a lane axis first.
-        cv_names, mv_names, cv_units, mv_units: names and units in the order of the arrays.
-        dt: sampling interval [s].
+        fields: the recorded fields of `Trajectory` by name, each with a lane axis first, which `setpoint` has, too.
     """
 
     lanes: np.ndarray

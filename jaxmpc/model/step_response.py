@@ -20,9 +20,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxmpc import html
-from jaxmpc.check import LARGEST, sound
+from jaxmpc.check import LARGEST, check_keys, is_number, sound
 from jaxmpc.errors import InputError
-from jaxmpc.files import write_atomically
+from jaxmpc.files import read_json, write_atomically
 
 FORMAT = "jaxmpc/step-response/1"
 HALF_CHARACTER = re.compile("[\ud800-\udfff]")  # JSON can escape one, UTF-8 cannot encode it
@@ -88,20 +88,14 @@ class StepResponseModel(eqx.Module):
     @classmethod
     def load(cls, path: str | Path) -> StepResponseModel:
         """Read a model written by `save`. Raises `InputError` naming the field that is wrong."""
-        try:
-            body = json.loads(Path(path).read_text())
-        except (OSError, ValueError, RecursionError) as error:  # no file, no text, no JSON
-            raise InputError("model file", str(path), f"a readable JSON file ({error})") from error
-        return cls.from_dict(body)
+        return cls.from_dict(read_json("model file", path))
 
     @classmethod
     def from_dict(cls, body: Any) -> StepResponseModel:
         """The model of a file's content. Raises `InputError` naming the field that is wrong."""
         if not isinstance(body, dict):
             raise InputError("model", type(body).__name__, "an object with dt, cv, mv and coefficients")
-        for key in ("dt", "cv", "mv", "coefficients"):
-            if key not in body:
-                raise InputError(f"model.{key}", "nothing", "a value (the key is missing)")
+        check_keys("model", body, ("dt", "cv", "mv", "coefficients"))
         return make_model(
             body["coefficients"],
             body["dt"],
@@ -148,7 +142,7 @@ def make_model(
             raise InputError(f"{path}.{key}", list(names), "one or more distinct, non-empty names")
         if any(HALF_CHARACTER.search(name) for name in names):
             raise InputError(f"{path}.{key}", list(names), "names of whole characters, which a file can hold")
-    if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not np.isfinite(dt) or dt <= 0:
+    if not is_number(dt) or dt <= 0:
         raise InputError(f"{path}.dt", dt, "a positive sampling interval [s]")
     try:
         array = np.array(coefficients, dtype=np.float64)

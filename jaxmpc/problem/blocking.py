@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, Int
 from jaxmpc.problem.structure import Structure
 
 
-@functools.lru_cache(maxsize=64)
 def block_starts(structure: Structure) -> Int[np.ndarray, " block"]:
     """First sample of every block."""
     return np.concatenate([[0], np.cumsum(structure.blocks)[:-1]]).astype(int)
@@ -37,7 +36,6 @@ def sample_moves(structure: Structure) -> Float[np.ndarray, "sample block"]:
     return matrix
 
 
-@functools.lru_cache(maxsize=64)
 def block_members(structure: Structure) -> Float[np.ndarray, "sample block"]:
     """Which samples belong to which block."""
     return np.repeat(np.eye(structure.block_count), structure.blocks, axis=0)
@@ -54,7 +52,6 @@ def coupled_blocks(structure: Structure) -> Bool[np.ndarray, " block"]:
     return np.concatenate([[False], alone[:-1] | (structure.blocking == "moves")])
 
 
-@functools.lru_cache(maxsize=64)
 def single_step_blocks(structure: Structure) -> np.ndarray:
     """Blocks whose move has a zero move beside it, so that the oscillation rows limit it to one step."""
     if structure.blocking == "moves":

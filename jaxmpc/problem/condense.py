@@ -33,16 +33,12 @@ class Rows(eqx.Module):
     """The hard rows on the moves: positions at the block ends, oscillation (6.16), windows (6.6), MV after MV.
 
     The rows of different MVs do not meet and are the same for all, so that products are those of one small matrix.
-
-    Attributes:
-        own: rows of one MV on its moves: positions of all blocks, differences of the moves of neighbouring blocks, windows.
-        size: their squared lengths.
-        count: samples that carry the move of a block.
     """
 
+    # of one MV on its moves: positions of all blocks, differences of neighbouring blocks, windows
     own: Float[Array, "row block"]
-    size: Float[Array, " row"]
-    count: Float[Array, " block"]
+    size: Float[Array, " row"]  # their squared lengths
+    count: Float[Array, " block"]  # samples that carry the move of a block
 
     @classmethod
     def of_layout(cls, layout: Layout) -> Rows:
@@ -92,53 +88,43 @@ class CondensedQp(eqx.Module):
 
     `response` and `summed` follow from the structure and the model alone: a batch of tunings shares them, and the Newton
     matrices of all its lanes are one matrix product. What the tuning scales is kept apart in `scale`.
-
-    Attributes:
-        response: predictions per MV unit of every move.
-        summed: `gram.running_sums` of them, or None where too large or too costly.
-        rows: hard rows.
-        hessian: H of the quadratic part without the integer moves' own weight if an envelope is used.
-        curvature: H with that weight included (valid at integer moves only).
-        move_weight: weight of x^2 that `hessian` holds, 0 where an envelope takes its place.
-        quadratic, soft_quadratic, soft_linear, deadzone: Q, S, s, c per prediction.
-        steep: slopes of the envelope of every move at 0, 1, 2, ... steps; no levels for the plain square.
-        slack_weight: rho per CV.
-        scale: MV units per unit of x.
-        row_size: squared length of every row of theta.
-        row_unit: its inverse in powers of `COARSE`, so that it changes at few samples of the horizon.
-        bend: curvature of every move outside all deadzones.
-        reach: what one unit of one move can do to a CV at most.
-        whole: moves of integer MVs.
-        position_weight: curvature of the tracking cost that whole positions pay along the chords of their square, per hard
-            row and without them in `hessian` (`integer.tighten`); None where there is none.
-        has_limits: whether any CV limit is finite (static; without, their rows are left out).
     """
 
-    response: Float[Array, "prediction n"]
+    response: Float[Array, "prediction n"]  # predictions per MV unit of every move
+    # `gram.running_sums` of them, or None where too large or too costly
     summed: Float[Array, "prediction pair"] | None
-    rows: Rows
+    rows: Rows  # hard rows
+    # H of the quadratic part without the integer moves' own weight if an envelope is used
     hessian: Float[Array, "n n"]
-    curvature: Float[Array, "n n"]
-    move_weight: Float[Array, " n"]
-    quadratic: Float[Array, " prediction"]
-    soft_quadratic: Float[Array, " prediction"]
-    soft_linear: Float[Array, " prediction"]
-    deadzone: Float[Array, " prediction"]
+    curvature: Float[Array, "n n"]  # H with that weight included (valid at integer moves only)
+    move_weight: Float[Array, " n"]  # weight of x^2 that `hessian` holds, 0 where an envelope takes its place
+    quadratic: Float[Array, " prediction"]  # Q
+    soft_quadratic: Float[Array, " prediction"]  # S
+    soft_linear: Float[Array, " prediction"]  # s
+    deadzone: Float[Array, " prediction"]  # c
+    # slopes of the envelope at 0, 1, 2, ... steps; no levels for the plain square
     steep: Float[Array, "level n"]
-    slack_weight: Float[Array, " cv"]
-    scale: Float[Array, " n"]
-    row_size: Float[Array, " prediction"]
-    row_unit: Float[Array, " prediction"]
-    bend: Float[Array, " n"]
-    reach: Float[Array, " cv"]
-    whole: Bool[Array, " n"]
+    slack_weight: Float[Array, " cv"]  # rho per CV
+    scale: Float[Array, " n"]  # MV units per unit of x
+    row_size: Float[Array, " prediction"]  # squared length of every row of theta
+    row_unit: Float[Array, " prediction"]  # its inverse in powers of `COARSE`, which changes at few samples
+    bend: Float[Array, " n"]  # curvature of every move outside all deadzones
+    reach: Float[Array, " cv"]  # what one unit of one move can do to a CV at most
+    whole: Bool[Array, " n"]  # moves of integer MVs
+    # curvature of the positions that is paid along the chords of their square and not in `hessian` (`integer.tighten`)
     position_weight: Float[Array, " hard"] | None
+    # whether any CV limit is finite (static; without, their rows are left out)
     has_limits: bool = eqx.field(static=True)
 
     @property
     def knot(self) -> np.ndarray:
         """Half widths of the levels of the envelope [steps], ``"level 1"``."""
         return np.arange(self.steep.shape[-2], dtype=float)[:, None]
+
+    @property
+    def unit(self) -> Float[Array, ""]:
+        """Of the objective, see `relaxed.gap.closes`."""
+        return jnp.maximum(jnp.max(jnp.diagonal(self.curvature, axis1=-2, axis2=-1), axis=-1), 1e-12)
 
     @property
     def theta(self) -> Float[Array, "prediction n"]:
@@ -158,9 +144,7 @@ def dynamic_matrix(
     """Theta of (5.4c) after blocking [CV unit per MV unit].
 
     Args:
-        layout: blocks.
         coefficients: S(1)..S(N); S keeps its last value beyond N.
-        j: samples of the predictions.
     """
     # a block of equal moves responds with the sum of delayed steps, S(0) = 0
     longest = j.shape[0] + coefficients.shape[-1]
@@ -178,8 +162,7 @@ class Matrices(eqx.Module):
     """What structure and model alone decide.
 
     Attributes:
-        response: predictions per MV unit of every move.
-        summed: `gram.running_sums` of them, or None where too large or too costly.
+        response, summed: as in `CondensedQp`.
         squared: response'response per CV.
         largest: largest size of a response per CV and move.
     """
@@ -196,8 +179,6 @@ def matrices_of(
     """The matrices that all tunings of a structure and model share.
 
     Args:
-        layout: the structure.
-        size: of its arrays.
         coefficients: step-response coefficients [CV unit per MV unit].
         summed: whether to keep the running sums of the responses (up to `SUMMED_BYTES`), which make a Newton
             step several times as fast; they take longer to make than one step takes.
@@ -228,10 +209,6 @@ def condense(
     """Build the constant part of the condensed problem (5.8)-(5.13), (6.6).
 
     Args:
-        layout: the structure.
-        size: of its arrays.
-        tuning: weights and limits in engineering units.
-        matrices: of the structure and the model.
         envelope: largest whole number of steps an integer move can make, for the envelope of its weight; 0 keeps the
             plain square.
         has_limits: whether any CV limit is finite (static; False drops their rows from the solver).

@@ -19,34 +19,21 @@ from jaxmpc.errors import InputError
 
 @dataclasses.dataclass(frozen=True)
 class Declared:
-    """One field.
+    """One field."""
 
-    Attributes:
-        unit: in terms of "CV unit" and "MV unit"; empty for what is not a number.
-        meaning: in few words, for legends and tables; ``{}`` stands for the CV or MV.
-        note: what else there is to know.
-        equation: symbol and equation of the thesis.
-        of: what it has one value for: every CV, every MV, or nothing (one for all).
-        default: None where it must be given.
-        least: least value that is accepted.
-        infinite: whether it may be infinite, and None in its place.
-        high: the field that must not lie below it, where the two are a pair of limits.
-        flag: whether values are true or false.
-        choices: the texts that are accepted, where it is one.
-        in_step: whether a single step needs it; the rest is about what a controller remembers between steps.
-    """
-
-    unit: str
-    meaning: str
-    note: str = ""
-    equation: str = ""
+    unit: str  # in terms of "CV unit" and "MV unit"; empty for what is not a number
+    meaning: str  # in few words, for legends and tables; ``{}`` stands for the CV or MV
+    note: str = ""  # what else there is to know
+    equation: str = ""  # symbol and equation of the thesis
+    # what it has one value for: every CV, every MV, or nothing (one for all)
     of: Literal["", "cv", "mv"] = ""
-    default: Any = None
-    least: float = 0.0
-    infinite: bool = False
-    high: str = ""
-    flag: bool = False
-    choices: tuple[str, ...] = ()
+    default: Any = None  # None where it must be given
+    least: float = 0.0  # least value that is accepted
+    infinite: bool = False  # whether it may be infinite, and None in its place
+    high: str = ""  # the field that must not lie below it, where the two are a pair of limits
+    flag: bool = False  # whether values are true or false
+    choices: tuple[str, ...] = ()  # the texts that are accepted, where it is one
+    # whether a single step needs it; the rest is about what a controller remembers between steps
     in_step: bool = True
 
     @property
@@ -63,9 +50,7 @@ class Declared:
         """Checked values in the order of `names`; of one number where the field has one for all.
 
         Args:
-            path: of the field, for errors.
             given: a vector, a mapping from name to value, or one value for all; None is infinite where that is allowed.
-            names: of the CVs or MVs.
 
         Raises:
             InputError: with the path, the value, what was expected and the unit.
@@ -129,10 +114,6 @@ def declare(
     """A field with its declaration.
 
     Args:
-        unit: see `Declared`, as for the three that follow.
-        meaning: in few words.
-        note: what else there is to know.
-        equation: of the thesis.
         preset: what an object has that is made without the field; none where arrays have to be made for it.
         **more: of `Declared`; without a default, what may be infinite is so.
     """

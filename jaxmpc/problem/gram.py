@@ -19,12 +19,7 @@ from jaxtyping import Array, Float
 
 
 def running_sums(response: Float[Array, "prediction n"], cvs: int) -> Float[Array, "prediction pair"]:
-    """Sums of the products of columns i <= j over the rows of each CV up to and including this one.
-
-    Args:
-        response: rows of all CVs, one CV after the other.
-        cvs: how many CVs these are.
-    """
+    """Sums of the products of columns i <= j over the rows of each CV, one CV after the other, up to this one."""
     first, second = np.triu_indices(response.shape[-1])
     # a compiler that knows the response would spend seconds on evaluating these sums itself
     response = jax.lax.optimization_barrier(response)
@@ -43,9 +38,7 @@ def gram(
     """The sum over all rows of their weight, level + sharp, times their products.
 
     Args:
-        response: rows of all CVs, one CV after the other.
         summed: their `running_sums`; None for one dense product.
-        cvs: number of CVs.
         level: weights that change at few rows.
         sharp: weights that few rows have. Any number of changes and rows is summed; few are fast.
     """

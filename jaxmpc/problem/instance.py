@@ -16,21 +16,14 @@ DRIFT = 1e-6  # share of a step that counts as float drift of a position
 
 
 class QpInstance(eqx.Module):
-    """What changes every sample: offsets and limits of one problem, in the units of `CondensedQp`.
+    """What changes every sample: offsets and limits of one problem, in the units of `CondensedQp`."""
 
-    Attributes:
-        offset: t0 = Lambda - r.
-        limit_high, limit_low: cv_high - r and cv_low - r (infinite where absent); empty where no CV has limits.
-        lower, upper: limits of x.
-        row_low, row_high: limits of the hard rows.
-    """
-
-    offset: Float[Array, " prediction"]
-    limit_high: Float[Array, " limit"]
+    offset: Float[Array, " prediction"]  # t0 = Lambda - r
+    limit_high: Float[Array, " limit"]  # cv_high - r, infinite where absent; empty where no CV has limits
     limit_low: Float[Array, " limit"]
-    lower: Float[Array, " n"]
+    lower: Float[Array, " n"]  # limits of x
     upper: Float[Array, " n"]
-    row_low: Float[Array, " hard"]
+    row_low: Float[Array, " hard"]  # limits of the hard rows
     row_high: Float[Array, " hard"]
 
 
@@ -50,10 +43,6 @@ def make_instance(
     """The problem of one sample.
 
     Args:
-        layout: the structure.
-        size: of its arrays.
-        tuning: limits in engineering units.
-        qp: the constant part.
         free_response: Lambda at j = 1, 2, ..., bias included [CV unit].
         setpoint: r at j = 1, 2, ... [CV unit].
         mv_now: MVs before the move [MV unit].

@@ -37,24 +37,16 @@ def rung(count: int, ladder: tuple[int, ...]) -> int:
 
 
 class Size(NamedTuple):
-    """What programs are compiled for, besides the numbers of CVs and MVs.
-
-    Attributes:
-        cvs, mvs: of the process.
-        blocks: moves per MV that are decided.
-        horizon: predictions per CV.
-        future: samples of the shift register, at least the prediction horizon and the coefficients of the model.
-        windows: rows of the predictive mean-move limit per MV; none in other modes.
-        past: moves that the mean-move limit remembers.
-    """
+    """What programs are compiled for, besides the numbers of CVs and MVs."""
 
     cvs: int
     mvs: int
-    blocks: int
-    horizon: int
+    blocks: int  # moves per MV that are decided
+    horizon: int  # predictions per CV
+    # samples of the shift register, at least the prediction horizon and the coefficients of the model
     future: int
-    windows: int
-    past: int
+    windows: int  # rows of the predictive mean-move limit per MV; none in other modes
+    past: int  # moves that the mean-move limit remembers
 
     @classmethod
     def of(cls, structure: Structure, samples: int) -> Size:
@@ -88,41 +80,26 @@ class Size(NamedTuple):
 
 
 class Layout(eqx.Module):
-    """A structure as arrays, padded to a `Size`.
+    """A structure as arrays, padded to a `Size`."""
 
-    Attributes:
-        start, length: first sample and samples of every block; padding has no samples.
-        count: samples that carry the move of a block (`blocking.moves_per_block`).
-        longer: blocks of several samples of which only the first may move (blocking ``inputs``).
-        single: `blocking.single_step_blocks`.
-        coupled: blocks whose move is coupled to the one before by an oscillation row (6.16).
-        window: rows of the predictive mean-move limit (6.6).
-        remaining: past moves that are still inside each of these windows.
-        share: of the past moves in the mean of the reactive mean-move limit (6.6); all zero in other modes.
-        window_length: samples of the window.
-        shift: the plan one sample later, in blocks again.
-        integer: integer MVs.
-        step: their steps [MV unit], 1 for continuous ones.
-        first, last: Hw and Hp.
-        dt: sampling interval [s].
-    """
-
-    start: Int[Array, " block"]
-    length: Int[Array, " block"]
-    count: Float[Array, " block"]
+    start: Int[Array, " block"]  # first sample of every block
+    length: Int[Array, " block"]  # samples of every block, none of padding
+    count: Float[Array, " block"]  # samples that carry the move of a block (`blocking.moves_per_block`)
+    # blocks of several samples of which only the first may move (blocking ``inputs``)
     longer: Bool[Array, " block"]
-    single: Bool[Array, " block"]
+    single: Bool[Array, " block"]  # `blocking.single_step_blocks`
+    # blocks whose move is coupled to the one before by an oscillation row (6.16)
     coupled: Bool[Array, " block"]
-    window: Float[Array, "window block"]
-    remaining: Float[Array, "window past"]
-    share: Float[Array, " past"]
-    window_length: Float[Array, ""]
-    shift: Float[Array, "block block"]
-    integer: Bool[Array, " mv"]
-    step: Float[Array, " mv"]
-    first: Int[Array, ""]
-    last: Int[Array, ""]
-    dt: Float[Array, ""]
+    window: Float[Array, "window block"]  # rows of the predictive mean-move limit (6.6)
+    remaining: Float[Array, "window past"]  # past moves that are still inside each of these windows
+    share: Float[Array, " past"]  # of the past moves in the reactive mean (6.6), 0 in other modes
+    window_length: Float[Array, ""]  # samples of the window
+    shift: Float[Array, "block block"]  # the plan one sample later, in blocks again
+    integer: Bool[Array, " mv"]  # integer MVs
+    step: Float[Array, " mv"]  # their steps [MV unit], 1 for continuous ones
+    first: Int[Array, ""]  # Hw
+    last: Int[Array, ""]  # Hp
+    dt: Float[Array, ""]  # sampling interval [s]
 
     @property
     def real(self) -> Bool[Array, " block"]:

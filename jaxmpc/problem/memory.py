@@ -1,7 +1,7 @@
 """Problems that cannot fit into memory, refused before anything is computed: horizons and blocks, ranges of whole moves.
 
 The estimates count the arrays of one solve, generously; a problem beyond `BUDGET` has a typing error in a horizon, a step
-or a limit. `step_solver` calls both.
+or a limit.
 """
 
 from __future__ import annotations
@@ -45,7 +45,6 @@ def check_ranges(structure: Structure, lower: np.ndarray, upper: np.ndarray) -> 
     """Refuse ranges of whole moves that a search cannot list.
 
     Args:
-        structure: names the integer MVs.
         lower, upper: limits ``"scenario integer"`` of all whole moves [steps], MV after MV.
 
     Raises:

@@ -7,13 +7,10 @@ Programs are compiled for its size only (`layout`), and see what follows from it
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Literal
 
-import numpy as np
-
 from jaxmpc import html
-from jaxmpc.check import LARGEST
+from jaxmpc.check import LARGEST, is_count, is_number
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.declared import declare, declared
@@ -71,7 +68,7 @@ class Structure:
     def __post_init__(self):
         for key in ("prediction_horizon", "control_horizon", "first_penalised", "mean_move_window"):
             value = getattr(self, key)
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+            if not is_count(value):
                 raise InputError(f"structure.{key}", value, "a whole number of samples, 1 or more")
             object.__setattr__(self, key, int(value))
         if self.first_penalised > self.prediction_horizon:
@@ -81,7 +78,7 @@ class Structure:
                 f"at most prediction_horizon = {self.prediction_horizon} samples",
             )
         blocks = tuple(self.blocks) or (1,) * self.control_horizon
-        if any(isinstance(b, bool) or not isinstance(b, (int, np.integer)) or b < 1 for b in blocks):
+        if not all(map(is_count, blocks)):
             raise InputError("structure.blocks", list(blocks), "block lengths in whole samples, 1 or more")
         object.__setattr__(self, "blocks", tuple(int(b) for b in blocks))
         if sum(blocks) != self.control_horizon:
@@ -94,17 +91,13 @@ class Structure:
             value, expected = getattr(self, key), " or ".join(map(repr, field.choices))
             if expected and value not in field.choices:
                 raise InputError(f"structure.{key}", value, expected)
-        if not (isinstance(self.dt, (int, float)) and math.isfinite(self.dt) and self.dt > 0):
+        if not is_number(self.dt) or self.dt <= 0:
             raise InputError("structure.dt", self.dt, "a positive sampling interval [s]")
         steps = tuple(self.integer_step) or (None,) * self.mv_count
         if len(steps) != self.mv_count:
             raise InputError("structure.integer_step", list(steps), f"{self.mv_count} entries, one per MV")
         for name, step in zip(self.mv_names, steps, strict=True):
-            if step is not None and (
-                isinstance(step, bool)
-                or not isinstance(step, (int, float))
-                or not 1 / LARGEST <= step <= LARGEST
-            ):
+            if step is not None and not (is_number(step) and 1 / LARGEST <= step <= LARGEST):
                 raise InputError(
                     f"structure.integer_step.{name}",
                     step,

@@ -112,7 +112,6 @@ class Tuning(eqx.Module):
 
 FIELDS = MappingProxyType(declared(Tuning))
 CV_FIELDS = tuple(key for key, field in FIELDS.items() if field.of == "cv")
-MV_FIELDS = tuple(key for key, field in FIELDS.items() if field.of == "mv" and not field.flag)
 LIMIT_PAIRS = tuple((key, field.high) for key, field in FIELDS.items() if field.high)
 DEFAULTS = MappingProxyType(
     {key: field.default for key, field in FIELDS.items() if field.default is not None}
@@ -123,8 +122,6 @@ def make_tuning(structure: Structure, *, path: str = "tuning", **fields) -> Tuni
     """Checked constructor of a `Tuning`.
 
     Args:
-        structure: gives the names and sizes.
-        path: prefix of the field names in errors.
         **fields: fields of `Tuning`; vectors in CV or MV order, a mapping from name to value, or one number for all.
             Limits take ``None`` for infinite. `cv_weight` and `move_weight` have no default;
             the others default to "off" (no deadzone, no limits; `slack_weight` 1000).

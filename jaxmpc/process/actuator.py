@@ -23,17 +23,10 @@ def _numeric(*values):  # NumPy stays NumPy: a loop on the host need not pay for
 
 
 def step_choke(position, demand):
-    """Position of the step choke after a demand.
+    """Position of the step choke [%] after a demand [%], which is limited to 0..100.
 
     It goes to the position (a multiple of 2 %) nearest to the demand if that is 1.6 % or more away from where
     the choke stands, and stays there otherwise. Halfway between two positions, the more open one is nearest.
-
-    Args:
-        position: where the choke stands [%].
-        demand: where it should be [%]; limited to 0..100.
-
-    Returns:
-        The new position [%], of the common shape.
     """
     xp = _numeric(position, demand)
     demand = xp.clip(demand, 0.0, 100.0)
@@ -42,15 +35,10 @@ def step_choke(position, demand):
 
 
 def move_choke(actuator: str, position, demand):
-    """Position of the choke after a demand, for either actuator.
+    """Position of the choke [%] after a demand [%], for either actuator.
 
     Args:
         actuator: ``continuous`` (follows the demand within 0..100 %) or ``step`` (see `step_choke`).
-        position: where the choke stands [%].
-        demand: where it should be [%].
-
-    Returns:
-        The new position [%].
     """
     if actuator == "step":
         return step_choke(position, demand)

@@ -18,6 +18,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxmpc.check import as_floats, is_number
 from jaxmpc.errors import InputError
 from jaxmpc.process.actuator import check_actuator, move_choke
 from jaxmpc.process.well.equations import (
@@ -49,59 +50,35 @@ class JaxOps:
 
 
 class WellState(eqx.Module):
-    """State of the plant.
+    """State of the plant."""
 
-    Attributes:
-        x: the states of the well in the order and units of `jaxmpc.process.well.equations.STATES`.
-        position: choke position after the actuator [%].
-        lift: lift demand that was last applied [m3/h].
-    """
-
+    # the states of the well in the order and units of `jaxmpc.process.well.equations.STATES`
     x: Float[Array, "8"]
-    position: Float[Array, ""]
-    lift: Float[Array, ""]
+    position: Float[Array, ""]  # choke position after the actuator [%]
+    lift: Float[Array, ""]  # lift demand that was last applied [m3/h]
 
 
 class WellOutputs(NamedTuple):
-    """What a plant measures; JAX arrays from `WellPlant`, NumPy values from the FMU plant.
+    """What a plant measures; JAX arrays from `WellPlant`, NumPy values from the FMU plant."""
 
-    Attributes:
-        cv: gas rate at standard conditions and oil rate [m3/h].
-        mv: choke position after the actuator [%] and lift demand [m3/h], as applied.
-        wellhead_pressure: upstream of the choke [bar].
-        bottom_hole_pressure: at the perforations [bar].
-        annulus_pressure: at the top of the annulus [bar].
-        injection_pressure: in the tubing at the gas-lift valve [bar].
-        delivered_lift: what the supply delivers [m3/h].
-        choke_opening: of the choke, which follows its position with a lag [%].
-    """
-
-    cv: Any
-    mv: Any
-    wellhead_pressure: Any
-    bottom_hole_pressure: Any
-    annulus_pressure: Any
-    injection_pressure: Any
-    delivered_lift: Any
-    choke_opening: Any
+    cv: Any  # gas rate at standard conditions and oil rate [m3/h]
+    mv: Any  # choke position after the actuator [%] and lift demand [m3/h], as applied
+    wellhead_pressure: Any  # upstream of the choke [bar]
+    bottom_hole_pressure: Any  # at the perforations [bar]
+    annulus_pressure: Any  # at the top of the annulus [bar]
+    injection_pressure: Any  # in the tubing at the gas-lift valve [bar]
+    delivered_lift: Any  # what the supply delivers [m3/h]
+    choke_opening: Any  # of the choke, which follows its position with a lag [%]
 
 
 class SteadyState(NamedTuple):
-    """Result of `steady_state`.
+    """Result of `steady_state`."""
 
-    Attributes:
-        x: ``"8"``, the state (of the last iteration, where it did not converge).
-        outputs: `WellOutputs` at that state.
-        converged: whether the scaled drift fell below `STEADY_TOLERANCE`.
-        drift: largest scaled rate of change left [1/s].
-        hours: simulated on the way [h].
-    """
-
-    x: Float[Array, "8"]
-    outputs: WellOutputs
-    converged: Bool[Array, ""]
-    drift: Float[Array, ""]
-    hours: Int[Array, ""]
+    x: Float[Array, "8"]  # ``"8"``, the state (of the last iteration, where it did not converge)
+    outputs: WellOutputs  # `WellOutputs` at that state
+    converged: Bool[Array, ""]  # whether the scaled drift fell below `STEADY_TOLERANCE`
+    drift: Float[Array, ""]  # largest scaled rate of change left [1/s]
+    hours: Int[Array, ""]  # simulated on the way [h]
 
 
 def rates(x: Float[Array, "8"], u: Float[Array, "3"], parameters: WellParameters) -> Float[Array, "8"]:
@@ -231,7 +208,7 @@ class WellPlant(eqx.Module):
     def __check_init__(self):
         for name in ("dt", "substep"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < np.inf:
+            if not is_number(value) or value <= 0:
                 raise InputError(f"plant.{name}", value, "a positive number of seconds")
         if abs(self.dt / self.substep - self.steps) > 1e-9 or self.steps < 1:
             raise InputError("plant.dt", self.dt, f"a whole number of substeps of {self.substep} s")
@@ -268,7 +245,6 @@ class WellPlant(eqx.Module):
         """One sample: move the actuators, hold the inputs for `dt`, and measure at the end.
 
         Args:
-            state: before the sample.
             mv: choke demand [%] (limited to 0..100 by the choke) and lift demand [m3/h] (0 or more).
             disturbance: offset of the reservoir pressure during the sample [bar].
 
@@ -294,7 +270,6 @@ class WellPlant(eqx.Module):
         """Apply a sequence of inputs, one row per sample.
 
         Args:
-            state: before the first sample.
             mv: ``"sample 2"``, choke [%] and lift [m3/h] demands.
             disturbance: one offset [bar], or one per sample.
 
@@ -324,9 +299,6 @@ def check_inputs(choke, lift, disturbance=0.0) -> None:
     for name, value, low, high, expected in limits:
         if isinstance(value, Tracer):
             continue
-        try:
-            number = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise InputError(name, value, expected) from None
+        number = as_floats(name, value, expected)
         if not np.isfinite(number).all() or (number < low).any() or (number > high).any():
             raise InputError(name, value, expected)

@@ -1,4 +1,4 @@
-"""Time of compiled calls, without what their first calls take to compile."""
+"""Time of compiled calls and of bars, without what first calls take to compile."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import jax
 
 
 class _Compiling(threading.local):
-    """Seconds that this thread has spent on compilation."""
+    """Seconds that this thread has spent on compilation; begin of every part of it, and the seconds before."""
 
-    seconds = 0.0
+    def __init__(self):
+        self.seconds, self.parts = 0.0, list[tuple[float, float]]()
 
 
 _here = _Compiling()
@@ -20,6 +21,10 @@ _here = _Compiling()
 
 def _heard(event: str, duration_secs: float, **_: Any) -> None:
     if event.startswith("/jax/core/compile"):
+        begin = time.perf_counter() - duration_secs
+        while _here.parts and _here.parts[-1][0] >= begin:  # a part of this one, which ends later
+            _here.seconds = _here.parts.pop()[1]
+        _here.parts.append((begin, _here.seconds))
         _here.seconds += duration_secs
 
 

@@ -1,9 +1,9 @@
-"""Compilation is seen: one line on standard error for every pause in which programs are compiled, and clocks without it.
+"""Compilation is seen: one line on standard error for every pause in which programs are compiled.
 
 A program of the core takes seconds to compile, in which nothing else can be seen. `watch` is called once, where the package
 is imported; from then on a timer runs beside every compilation and says so if it takes long. Programs that are loaded
 from the cache are not compiled, and those that are compiled in a moment end before the timer does. Who knows what the
-programs are for says so with `compiling_for`; the app takes the line with `told` to show it; bars do not count its time.
+programs are for says so with `compiling_for`; the app takes the line with `told` to show it.
 """
 
 from __future__ import annotations
@@ -65,7 +65,6 @@ class Compilation:
         self._lock = threading.Lock()
         self._running: set[object] = set()
         self._begun = self._pause = self._ended = -math.inf  # now, of this pause, last time
-        self._total = 0.0
         self._said = False
         self._timer: threading.Timer | None = None
 
@@ -102,7 +101,6 @@ class Compilation:
             if self._running:
                 return
             self._ended = time.monotonic()
-            self._total += self._ended - self._begun
             timer, self._timer = self._timer, None
         if timer is not None:
             timer.cancel()
@@ -113,11 +111,6 @@ class Compilation:
         self._said = True
         if not being_left():
             self.listeners[-1](line(self.subjects[-1] if self.subjects else ""))
-
-    def seconds(self) -> float:
-        """Time in which something was compiled, until now [s]."""
-        with self._lock:
-            return self._total + (time.monotonic() - self._begun if self._running else 0.0)
 
 
 _compilation = Compilation()
@@ -168,20 +161,3 @@ def _entered(stack: list[Any], entry: Any) -> Iterator[None]:
         yield
     finally:
         stack.remove(entry)
-
-
-def clock() -> float:
-    """Seconds that pass while nothing is compiled in this process; only differences mean anything."""
-    return time.monotonic() - _compilation.seconds()
-
-
-def compiled_since() -> Callable[[], float]:
-    """A function that returns for how many seconds something was compiled since its last call, or since now."""
-    seen = _compilation.seconds()
-
-    def passed() -> float:
-        nonlocal seen
-        before, seen = seen, _compilation.seconds()
-        return seen - before
-
-    return passed

@@ -235,10 +235,6 @@ def held() -> Iterator[None]:
 def run_program(words: list[str], environment: dict[str, str]) -> tuple[int, str]:
     """Run a program; should this process be stopped, it ends with everything that it has started.
 
-    Args:
-        words: program and arguments.
-        environment: of the program.
-
     Returns:
         Exit status, and what it printed.
     """

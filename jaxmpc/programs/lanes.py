@@ -20,15 +20,10 @@ T = TypeVar("T")
 
 
 class Lanes(eqx.Module, Generic[T]):
-    """A batch of `T`, split into arrays with a leading lane axis and everything else.
+    """A batch of `T`, split into arrays with a leading lane axis and everything else."""
 
-    Attributes:
-        each: a `T` with the arrays that have a lane axis, None in all other places.
-        shared: a `T` with None in these places and what all lanes share in the others.
-    """
-
-    each: Any
-    shared: Any
+    each: Any  # a `T` with the arrays that have a lane axis, None in all other places
+    shared: Any  # a `T` with None in these places and what all lanes share in the others
 
     @property
     def count(self) -> int | None:
@@ -40,13 +35,14 @@ class Lanes(eqx.Module, Generic[T]):
 
     @property
     def value(self) -> T:
-        """The `T` whose arrays have a lane axis where `axes` says so; what `jax.vmap` takes."""
+        """The `T` whose arrays have a lane axis where `each` has them."""
         return eqx.combine(self.each, self.shared)
 
-    @property
-    def axes(self) -> T:
-        """``in_axes`` of `value` for `jax.vmap` and `eqx.filter_vmap`: 0 for a lane axis, None for none."""
-        return jax.tree.map(lambda _: 0, self.each)
+    def vmap(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """The results of ``function(lane, *arguments)``, whose arguments have a lane axis each."""
+        return jax.vmap(lambda own, *rest: function(eqx.combine(own, self.shared), *rest))(
+            self.each, *arguments
+        )
 
     def lane(self, k: int) -> T:
         """The `T` of lane k alone."""

@@ -8,7 +8,9 @@ What stays is taken apart only once (`flattened`), as a module of arrays would b
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -21,17 +23,11 @@ FLOAT = np.dtype(float)
 
 @dataclasses.dataclass(frozen=True)
 class Packing:
-    """Where the arrays of a tree lie in one array ``"lane entry"``; hashable, so that it can be a static argument.
+    """Where the arrays of a tree lie in one array ``"lane entry"``; hashable, so that it can be a static argument."""
 
-    Attributes:
-        form: structure of the tree.
-        shapes: of its arrays, without the lane axis.
-        kinds: their types.
-    """
-
-    form: Any
-    shapes: tuple[tuple[int, ...], ...]
-    kinds: tuple[np.dtype, ...]
+    form: Any  # structure of the tree
+    shapes: tuple[tuple[int, ...], ...]  # of its arrays, without the lane axis
+    kinds: tuple[np.dtype, ...]  # their types
 
     @classmethod
     def of(cls, tree: Any) -> Packing:
@@ -81,3 +77,31 @@ def flattened(tree: Any) -> tuple[list[jax.Array], Form]:
 def rebuilt(form: Form, leaves: Any) -> Any:
     """The tree again; see `flattened`."""
     return eqx.combine(jax.tree.unflatten(form.structure, leaves), form.rest)
+
+
+class PackedCall:
+    """A compiled ``function(constant, *given)`` that takes and returns what changes in one piece.
+
+    A copy learns the packings anew: forms of trees do not survive one.
+    """
+
+    def __init__(self, function: Callable[..., Any]):
+        self.function = function
+        self._packings: tuple[Packing, Packing] | None = None
+
+    def __reduce__(self):
+        return PackedCall, (self.function,)
+
+    def __call__(self, constant: Any, flat: tuple[list[jax.Array], Form], *given: Any) -> Any:
+        """What it returns, NumPy's arrays; `flat` is the constant `flattened`, all given has a lane axis first."""
+        if self._packings is None:
+            shapes = jax.eval_shape(self.function, constant, *given)
+            self._packings = Packing.of(given), Packing.of(shapes)
+        (leaves, form), (into, out) = flat, self._packings
+        return out.unpack(np.asarray(_packed(leaves, into.pack(given), self.function, form, into)))
+
+
+@functools.partial(jax.jit, static_argnames=("function", "form", "packing"))
+def _packed(leaves, packed, function, form: Form, packing: Packing):
+    out = function(rebuilt(form, leaves), *packing.unpack(packed))
+    return Packing.of(out).pack(out)

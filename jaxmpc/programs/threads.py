@@ -47,7 +47,6 @@ def side_by_side(work: Callable[[T, Callable[[], bool]], Any], parts: Sequence[T
 
     Args:
         work: of a part and of a function that says whether to give up, because another part failed or the user interrupts.
-        parts: what to work on.
     """
     stopped = threading.Event()
     if len(parts) == 1 or cores() == 1:

@@ -48,7 +48,9 @@ DAMPING, MOST_DAMPING, DAMP = 1e-4, 10.0, 10.0  # on the diagonal after short st
 SEARCHES = 12  # trials of the line search
 FLAT = 0.3  # share of its slope at the start that the merit may have where a line search ends
 UPHILL = 1e-3  # the same for a merit that may be above that at the start
-INEXACT = 0.1  # of the root of the change of the prices, squared: a gradient below it is good enough to take them
+INEXACT = (
+    0.1  # of the root of the change of the prices, squared: a gradient below it is good enough to take them
+)
 NOTHING = 0.01  # gradient without moves, and moves, below which there is next to nothing to gain
 SETTLED, EXACT = 1e-7, 1e-12  # share of the gradient without moves left when prices are taken, and at the end
 # 1e-10 ended a step of the thesis run too early
@@ -172,8 +174,8 @@ class _Proximal(NamedTuple):
     def _chords(self, point: _Point, old: _Families) -> tuple[Float[Array, " hard"], Bool[Array, " hard"]]:
         """Prices of the chords of D w^2, and whether a position is held at a whole number.
 
-        With z = sigma w + price it is held at k where z is within D of k (sigma + 2 D), and between k and k + 1 the price is the
-        slope D (2 k + 1) of the chord.
+        With z = sigma w + price it is held at k where z is within D of k (sigma + 2 D); between k and k + 1 the price is
+        the slope D (2 k + 1) of the chord.
         """
         weight, sigma = self.problem.position, self.sigma.position
         z = sigma * point.w + old.position

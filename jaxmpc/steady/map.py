@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxmpc.check import as_floats, check_keys
 from jaxmpc.errors import InputError
-from jaxmpc.files import write_atomically
+from jaxmpc.files import read_json, write_atomically
 
 FORMAT = "jaxmpc/steady-map/1"
 INSIDE = 1e-9  # barycentric coordinate down to which a point belongs to a triangle
@@ -49,7 +50,7 @@ class SteadyMap:
 
     def __post_init__(self):
         for key, unit in (("choke", "%"), ("lift", "m3/h")):
-            grid = _array(f"map.{key}", getattr(self, key), f"two or more increasing values [{unit}]")
+            grid = as_floats(f"map.{key}", getattr(self, key), f"two or more increasing values [{unit}]")
             if grid.ndim != 1 or len(grid) < 2 or not np.isfinite(grid).all() or (np.diff(grid) <= 0).any():
                 raise InputError(f"map.{key}", grid.tolist(), f"two or more increasing values [{unit}]")
             object.__setattr__(self, key, grid)
@@ -66,7 +67,7 @@ class SteadyMap:
             if len(getattr(self, key)) != count:
                 raise InputError(f"map.{key}", list(getattr(self, key)), f"{count} units, one per name")
         shape = (len(self.cv_names), len(self.lift), len(self.choke))
-        cv = _array("map.cv", self.cv, f"numbers of shape {list(shape)}, CV by lift by choke")
+        cv = as_floats("map.cv", self.cv, f"numbers of shape {list(shape)}, CV by lift by choke")
         if cv.shape != shape or np.isinf(cv).any():
             raise InputError(
                 "map.cv", f"shape {list(cv.shape)}", f"numbers of shape {list(shape)}, none infinite"
@@ -118,12 +119,7 @@ class SteadyMap:
         return np.flatnonzero(np.isnan(self.values).any(axis=1))
 
     def interpolate(self, choke, lift) -> Float[np.ndarray, "cv ..."]:
-        """CVs between the grid points, linear over the triangles; NaN outside of them.
-
-        Args:
-            choke: positions [%], any shape.
-            lift: rates [m3/h], a shape that goes with it.
-        """
+        """CVs at positions [%] and lift rates [m3/h] of any shape, linear over the triangles; NaN outside of them."""
         choke, lift = np.broadcast_arrays(np.asarray(choke, np.float64), np.asarray(lift, np.float64))
         triangles, values = self.triangles, self.values
         out = np.full((choke.size, len(self.cv_names)), np.nan)
@@ -152,15 +148,10 @@ class SteadyMap:
     @classmethod
     def load(cls, path: str | Path) -> SteadyMap:
         """Read a map written by `save`. Raises `InputError` naming the field that is wrong."""
-        try:
-            body = json.loads(Path(path).read_text())
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError("map file", str(path), f"a readable JSON file ({error})") from error
+        body = read_json("map file", path)
         if not isinstance(body, dict):
             raise InputError("map file", str(path), "a JSON object with choke, lift, cv and values")
-        for key in ("choke", "lift", "cv", "values"):
-            if key not in body:
-                raise InputError(f"map.{key}", "nothing", "a value (the key is missing)")
+        check_keys("map", body, ("choke", "lift", "cv", "values"))
         return cls(
             body["choke"],
             body["lift"],
@@ -190,10 +181,3 @@ def _with_null(values):
     if isinstance(values, list):
         return [_with_null(value) for value in values]
     return None if np.isnan(values) else values
-
-
-def _array(path: str, value, expected: str) -> np.ndarray:
-    try:
-        return np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(path, value, expected) from None

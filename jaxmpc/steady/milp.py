@@ -15,9 +15,10 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from jaxmpc.integer.highs import solve_milp
+from jaxmpc.steady.map import SteadyMap
 
 Goal = Literal["violation", "distance", "profit"]
 GOALS: tuple[Goal, ...] = ("violation", "distance", "profit")
@@ -43,29 +44,19 @@ class PiecewiseMilp:
     """Violation, distance or profit over the triangles of a steady map, one after the other.
 
     Args:
-        points: choke and lift of the grid points, choke fastest.
-        values: CVs of the grid points, NaN where there is no steady state.
-        used: which grid points are corners of a triangle.
-        loose_edges: pairs of used points that have no triangle in common, but had if others were used.
-        width: grid points of the choke.
+        map: of which only the corners of triangles count.
         profit: of the grid points.
         weight: of deviations and violations per CV.
         span: size of each CV, for scaling.
         low, high: limits per CV, infinite for none.
         demand: per CV, NaN for none.
-        lift_ranges: allowed lift, rising.
-        choke: allowed choke.
         choke_step: of the step choke, None for any position.
     """
 
     def __init__(
         self,
         *,
-        points: Float[np.ndarray, "point 2"],
-        values: Float[np.ndarray, "point cv"],
-        used: Bool[np.ndarray, " point"],
-        loose_edges: Int[np.ndarray, "edge 2"],
-        width: int,
+        map: SteadyMap,
         profit: Float[np.ndarray, " point"],
         weight: Float[np.ndarray, " cv"],
         span: Float[np.ndarray, " cv"],
@@ -76,10 +67,12 @@ class PiecewiseMilp:
         choke: tuple[float, float],
         choke_step: float | None,
     ):
+        points = map.points
         self.points, self.choke, self.choke_step, self.ranges = points, choke, choke_step, lift_ranges
-        values, profit = np.where(used[:, None], values, 0.0), np.where(used, profit, 0.0)
+        used = np.isin(np.arange(len(points)), map.triangles)
+        values, profit = np.where(used[:, None], map.values, 0.0), np.where(used, profit, 0.0)
         count, cvs = values.shape
-        codes = _exclusions(width, count // width) + [(edge[:1], edge[1:]) for edge in loose_edges]
+        codes = _exclusions(len(map.choke), len(map.lift)) + [(e[:1], e[1:]) for e in map.loose_edges]
         size = {"share": count, "code": len(codes), "range": len(lift_ranges), "steps": 1}
         size |= dict.fromkeys(("above", "below", "more", "less"), cvs)  # violations, deviations per CV [span]
         ends = np.cumsum(list(size.values()))
@@ -130,18 +123,14 @@ class PiecewiseMilp:
         self.high[outside] = np.where(np.tile(wanted, 2), np.inf, 0.0)
         self.demanded = bool(wanted.any())
         paid = weight * span
-        self._unit: dict[Goal, float] = dict.fromkeys(GOALS, float(paid.max()))
-        self._unit["profit"] = float(np.abs(profit).max()) or 1.0
+        self.unit: dict[Goal, float] = dict.fromkeys(GOALS, float(paid.max()))
+        self.unit["profit"] = float(np.abs(profit).max()) or 1.0
         self.cost: dict[Goal, np.ndarray] = {goal: np.zeros(total) for goal in GOALS}
         for name in ("above", "below"):
-            self.cost["violation"][at[name]] = paid / self._unit["violation"]
+            self.cost["violation"][at[name]] = paid / self.unit["violation"]
         for name in ("more", "less"):
-            self.cost["distance"][at[name]] = paid / self._unit["distance"]
-        self.cost["profit"][at["share"]] = -profit / self._unit["profit"]
-
-    def unit_of(self, goal: Goal) -> float:
-        """Size of a goal, for its gap."""
-        return self._unit[goal]
+            self.cost["distance"][at[name]] = paid / self.unit["distance"]
+        self.cost["profit"][at["share"]] = -profit / self.unit["profit"]
 
     def solve(self) -> Best | None:
         """The best point, None if the MV limits leave nothing of the map.
@@ -167,7 +156,7 @@ class PiecewiseMilp:
             again, _ = self._minimise(goal)
             x = x if again is None else again  # lost to rounding: keep what is proven
         sign = -1.0 if first == "profit" else 1.0
-        return Best(self._mv(x), first, sign * bound * self._unit[first])
+        return Best(self._mv(x), first, sign * bound * self.unit[first])
 
     def _asked(self, goal: Goal) -> bool:
         """Whether a goal says anything; the profit always does where it is the only one."""

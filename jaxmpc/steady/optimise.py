@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from jaxmpc.check import is_number
 from jaxmpc.errors import InputError
 from jaxmpc.steady.map import SteadyMap, barycentric
 from jaxmpc.steady.milp import PiecewiseMilp
@@ -111,7 +112,7 @@ def optimise(
             )
     ranges = _ranges(lift_ranges)
     choke_low, choke_high = _pair("choke", choke, "%")
-    if choke_step is not None and not (_number(choke_step) and choke_step > 0):
+    if choke_step is not None and not (is_number(choke_step) and choke_step > 0):
         raise InputError("choke_step", choke_step, "a positive step [%], or None for any position")
     demanded = _named("target", target, names, "CV unit")
     demand = np.array([demanded.get(name, np.nan) for name in names])
@@ -125,11 +126,7 @@ def optimise(
     value = np.array([price.get(name, 0.0) for name in names])
     cost_of_lift = price.get(lift_name, 0.0)
     milp = PiecewiseMilp(
-        points=map.points,
-        values=map.values,
-        used=np.isin(np.arange(len(map.points)), map.triangles),
-        loose_edges=map.loose_edges,
-        width=len(map.choke),
+        map=map,
         profit=map.values @ value - cost_of_lift * map.points[:, 1],
         weight=weight,
         span=span,
@@ -165,7 +162,7 @@ def optimise(
     missed = (np.nan_to_num(deviation) != 0) & (weight > 0)
     feasible = not violation.any() and not missed.any()
     reached = {"profit": profit, "distance": distance, "violation": float(weight @ violation)}[best.goal]
-    scale = max(abs(reached), MET * milp.unit_of(best.goal))
+    scale = max(abs(reached), MET * milp.unit[best.goal])
     return Targets(
         status="optimal" if feasible else "closest",
         feasible=feasible,
@@ -195,14 +192,6 @@ def _message(map: SteadyMap, cv, violation, deviation) -> str:
     return "Within all limits." if not parts else "Out of reach: " + "; ".join(parts) + "."
 
 
-def _number(value) -> bool:
-    return (
-        isinstance(value, (int, float, np.number))
-        and not isinstance(value, bool)
-        and bool(np.isfinite(value))
-    )
-
-
 def _named(path: str, given, names: tuple[str, ...], unit: str) -> dict[str, float]:
     """A mapping from some of the names to finite numbers."""
     if given is None:
@@ -212,7 +201,7 @@ def _named(path: str, given, names: tuple[str, ...], unit: str) -> dict[str, flo
     for name, value in given.items():
         if name not in names:
             raise InputError(f"{path}.{name}", value, f"one of the names {', '.join(names)}")
-        if not _number(value):
+        if not is_number(value):
             raise InputError(f"{path}.{name}", value, f"a finite number [{unit}]")
     return {name: float(value) for name, value in given.items()}
 
@@ -227,17 +216,14 @@ def _limits(path: str, given, map: SteadyMap, infinite: float) -> np.ndarray:
         if len(listed) != len(names):
             raise InputError(path, listed, f"{len(names)} numbers for {', '.join(names)}, None for no limit")
         given = dict(zip(names, listed, strict=True))
-    present = {name: v for name, v in given.items() if v is not None and not (_infinite(v, infinite))}
+    none = lambda v: v is None or (isinstance(v, (int, float, np.number)) and float(v) == infinite)  # noqa: E731
+    present = {name: value for name, value in given.items() if not none(value)}
     units = dict(zip(names, map.cv_units, strict=True))
     for name, value in present.items():
-        if name in units and not _number(value):
+        if name in units and not is_number(value):
             raise InputError(f"{path}.{name}", value, f"a number [{units[name]}], None for no limit")
     found = _named(path, present, names, "CV unit")
     return np.array([found.get(name, infinite) for name in names])
-
-
-def _infinite(value, infinite: float) -> bool:
-    return isinstance(value, (int, float, np.number)) and float(value) == infinite
 
 
 def _pair(path: str, given, unit: str) -> tuple[float, float]:
@@ -245,7 +231,7 @@ def _pair(path: str, given, unit: str) -> tuple[float, float]:
         least, most = given
     except (TypeError, ValueError):
         raise InputError(path, given, f"a pair of smallest and largest value [{unit}]") from None
-    if not (_number(least) and _number(most) and least <= most):
+    if not (is_number(least) and is_number(most) and least <= most):
         raise InputError(path, given, f"two finite numbers, the smaller one first [{unit}]")
     return float(least), float(most)
 

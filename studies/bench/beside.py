@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import dataclasses
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -12,104 +13,88 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from studies.bench.context import Context
-from studies.bench.judge import Judge, ratio, repeated
+from studies.bench.judge import Judge, repeated
 from studies.bench.peers import Peer, PeerAnswer
 from studies.bench.rows import RIGHT, Row, timed
 
 Plan = np.ndarray | None
 
 
-class Asked(NamedTuple):
-    """What a peer answered.
+class Heard(NamedTuple):
+    """How one of our ways or a peer did."""
 
-    Attributes:
-        at: positions of the problems that it was asked.
-        seconds: ``"problem"``, of its own work.
-        answers: one per problem.
-    """
-
-    at: np.ndarray
-    seconds: np.ndarray
-    answers: list[PeerAnswer]
+    at: np.ndarray  # positions of the problems that it was given
+    seconds: np.ndarray  # "problem", of its own work
+    answers: list[PeerAnswer]  # of a peer, one per problem
 
 
+@dataclasses.dataclass
 class Contest:
-    """The problems of one table of solvers, with everybody's times and answers.
+    """The problems of one table of solvers, with everybody's times and answers."""
 
-    Args:
-        context: of the run.
-        section: of the rows.
-        name: of the problems, which the rows begin with.
-        cases: contents of case files.
-        peers: that are asked too; ratios are to the first.
-        tolerance: that they are asked for.
-        polish: applied to their plans before these are judged, so that tolerances do not count.
-        in_time: whether a problem that a peer did not finish in time counts as not solved, whatever it had by then.
-    """
+    context: Context
+    name: str  # of the problems, which the rows begin with
+    cases: Sequence[dict]  # contents of case files
+    peers: tuple[Peer, ...] = ()  # that are asked too; ratios are to the first
+    tolerance: float = 0.0  # that they are asked for
+    # applied to their plans before these are judged, so that tolerances do not count
+    polish: Callable[[dict, Plan], Plan] = lambda case, plan: plan
+    in_time: bool = (
+        False  # whether a problem that a peer did not finish in time is not solved, whatever it had by then
+    )
 
-    def __init__(
-        self,
-        context: Context,
-        section: str,
-        name: str,
-        cases: Sequence[dict],
-        peers: tuple[Peer, ...] = (),
-        tolerance: float = 0.0,
-        polish: Callable[[dict, Plan], Plan] = lambda case, plan: plan,
-        in_time: bool = False,
-    ):
-        self.context, self.section, self.name, self.peers = context, section, name, peers
-        self.tolerance, self.polish, self.in_time = tolerance, polish, in_time
-        self.judge = Judge(cases)
-        self._ours: dict[str, np.ndarray] = {}
-        self._theirs: dict[str, Asked] = {}
+    def __post_init__(self):
+        self.judge = Judge(self.cases)
+        self._heard: dict[str, Heard] = {}
         self._without: dict[str, Row] = {}
 
-    def enter(self, way: str, seconds: np.ndarray, plans: Sequence[Plan]) -> None:
-        """Take in how one of our ways did on all problems."""
-        self._ours[way] = seconds
-        self.judge.hear(way, plans)
+    def enter(self, who: str, seconds: np.ndarray, plans: Sequence[Plan], at=None, answers=()) -> None:
+        """Take in how one of our ways did on all problems, or a peer on those at some positions."""
+        at = np.arange(len(seconds)) if at is None else at
+        self._heard[who] = Heard(at, seconds, list(answers))
+        self.judge.hear(who, plans, at)
 
     def ask_peers(self) -> None:
-        """Let every peer that is there solve its share of the problems."""
+        """Let every peer that is there solve its share of the problems: evenly spread, a few for a slow one."""
         for peer in self.peers:
             name = f"{self.name}: {peer.name}"
-            row = absent(peer, self.context, self.section, name)
-            if row is None:
+            most = min(len(self.cases), round(peer.limit * self.context.size.peer_share))
+            why = peer.missing()
+            if why is not None:
+                self._without[peer.name] = Row(name=name, status="missing", note=why)
+            elif not most:
+                note = "too slow for this size of run"
+                self._without[peer.name] = Row(name=name, status="not measured", note=note)
+            else:
                 self.context.say(name)
                 try:
-                    self._ask(peer)
-                    continue
+                    self._ask(peer, np.unique(np.linspace(0, len(self.cases) - 1, most).astype(int)))
                 except Exception as error:  # a licence that is too small shows only when it is used
-                    why = " ".join(str(error).split())
-                    row = Row(name=name, section=self.section, status="failed", note=why)
-            self._without[peer.name] = row
+                    note = " ".join(str(error).split())
+                    self._without[peer.name] = Row(name=name, status="failed", note=note)
 
-    def _ask(self, peer: Peer) -> None:
-        at = asked(peer, self.context, len(self.judge.cases))
-        cases = [self.judge.cases[i] for i in at]
+    def _ask(self, peer: Peer, at: np.ndarray) -> None:
+        cases = [self.cases[i] for i in at]
         seconds, answers, plans = ask(peer, self.context, cases, self.tolerance)
         plans = [self.polish(case, plan) for case, plan in zip(cases, plans, strict=True)]
-        self.judge.hear(peer.name, plans, at)
-        self._theirs[peer.name] = Asked(at, seconds, answers)
+        self.enter(peer.name, seconds, plans, at, answers)
 
     def row(self, way: str, label: str, **more: Any) -> Row:
         """The row of one of our ways; further fields as for `timed`."""
-        seconds = self._ours[way]
-        name = f"{self.name}: {label}"
-        found = self._ratio(np.arange(len(seconds)), seconds)
-        return timed(name, self.section, seconds, self.judge.errors(way), **found, **more)
+        seconds, found = self._heard[way].seconds, self._ratio(way)
+        return timed(f"{self.name}: {label}", seconds, self.judge.errors(way), **found, **more)
 
-    def _ratio(self, at: np.ndarray, seconds: np.ndarray) -> dict[str, Any]:
-        """How many times as fast as the first peer, on the problems that both were given."""
-        known = self._theirs.get(self.peers[0].name) if self.peers else None
+    def _ratio(self, who: str) -> dict[str, Any]:
+        """How many times as fast as the first peer, by the medians of the problems that both were given."""
+        known = self._heard.get(self.peers[0].name) if self.peers else None
         if known is None:
             return {}
-        times = np.full(len(self.judge.cases), np.nan)
-        times[at] = seconds
-        common = np.intersect1d(at, known.at)
+        own = self._heard[who]
+        _, ours, theirs = np.intersect1d(own.at, known.at, return_indices=True)
         return {
-            "ratio": ratio(times, known.seconds[np.isin(known.at, common)], common),
+            "ratio": float(np.median(known.seconds[theirs]) / np.median(own.seconds[ours]))
+            if len(ours)
+            else None,
             "ratio_to": self.peers[0].name,
             "ratio_is_lower_bound": self.in_time and any(one.status == "limit" for one in known.answers),
         }
@@ -120,41 +105,21 @@ class Contest:
             yield self._without.get(peer.name) or self._peer_row(peer)
 
     def _peer_row(self, peer: Peer) -> Row:
-        at, seconds, answers = self._theirs[peer.name]
+        _, seconds, answers = self._heard[peer.name]
         name, errors = f"{self.name}: {peer.name}", self.judge.errors(peer.name)
         if not self.in_time:
-            return timed(name, self.section, seconds, errors, note=peer.timed, **self._ratio(at, seconds))
+            return timed(name, seconds, errors, note=peer.timed, **self._ratio(peer.name))
         finished = np.array([answer.status == "optimal" for answer in answers])
-        row = timed(name, self.section, seconds, np.where(finished, errors, np.nan))
+        row = timed(name, seconds, np.where(finished, errors, np.nan))
         row.counts = row.worst_error is None or row.worst_error <= RIGHT
         row.note = f"{peer.timed}; stopped after {min(peer.hopeless, self.context.size.cut_off):g} s"
         return row
 
 
-def asked(peer: Peer, context: Context, count: int) -> np.ndarray:
-    """Positions of the problems that a peer is asked, evenly spread: all, a few for a slow one, or none."""
-    most = min(count, round(peer.limit * context.size.peer_share))
-    return np.unique(np.linspace(0, count - 1, most).astype(int))
-
-
-def absent(peer: Peer, context: Context, section: str, name: str) -> Row | None:
-    """The row of a peer that is not installed or left out of this run, None for one that is asked."""
-    why = peer.missing()
-    if why is not None:
-        return Row(name=name, section=section, status="missing", note=why)
-    if not len(asked(peer, context, 1_000_000)):
-        return Row(name=name, section=section, status="not measured", note="too slow for this size of run")
-    return None
-
-
 def ask(
     peer: Peer, context: Context, cases: Iterable[dict], tolerance: float
 ) -> tuple[np.ndarray, list[PeerAnswer], list[Plan]]:
-    """Let a peer solve problems.
-
-    Returns:
-        Seconds ``"problem"``, answers, and plans ``"block mv"`` [MV unit] or None.
-    """
+    """Seconds ``"problem"`` of a peer on some cases, its answers, and its plans ``"block mv"`` [MV unit] or None."""
     solve = peer.begin(tolerance, min(peer.hopeless, context.size.cut_off))
     seconds, answers, plans = [], [], []
     for case in cases:

@@ -16,53 +16,34 @@ from studies.definition import references
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """How much is measured.
+    """How much is measured."""
 
-    Attributes:
-        modes: blocking modes.
-        run: samples of a recorded run, None for the whole reference.
-        relaxed, exact: problems per blocking mode.
-        hardest: longest solves of a run, measured beside the others.
-        lanes: distinct problems of a batch; larger batches repeat them.
-        batches: batch sizes; 512 has the floor.
-        peer_share: of the problems a slow peer is asked; one that would be asked none is left out.
-        cut_off: most seconds that one solve of a peer may take.
-        variants, variant_samples: of the continuous closed loops advanced together.
-        together, together_samples: of the mixed-integer closed loops advanced together.
-        growth: of horizon [samples], blocks, CVs and MVs.
-        startup_modes: blocking modes whose first call is measured.
-        sweep_chunks, sweep_samples: of the sweep whose overhead is measured.
-        sweep_stored: scenarios of the store that is opened.
-        sweep_scanned: chunks of the store that is resumed.
-        sweep_memory: chunks of the two sweeps whose memory is compared.
-    """
-
-    modes: tuple[Mode, ...] = MODES
-    run: int | None = None
-    relaxed: int = 130
+    modes: tuple[Mode, ...] = MODES  # blocking modes
+    run: int | None = None  # samples of a recorded run, None for the whole reference
+    relaxed: int = 130  # problems per blocking mode
     exact: int = 130
-    hardest: int = 10
-    lanes: int = 512
-    batches: tuple[int, ...] = (1, 8, 64, 512, 4096)
-    peer_share: float = 1.0
-    cut_off: float = 15.0
-    variants: int = 256
+    hardest: int = 10  # longest solves of a run, measured beside the others
+    lanes: int = 512  # distinct problems of a batch; larger batches repeat them
+    batches: tuple[int, ...] = (1, 8, 64, 512, 4096)  # batch sizes; 512 has the floor
+    peer_share: float = 1.0  # of the problems a slow peer is asked; one that would be asked none is left out
+    cut_off: float = 15.0  # most seconds that one solve of a peer may take
+    variants: int = 256  # continuous closed loops advanced together
     variant_samples: int = 900
-    together: int = 64
+    together: int = 64  # mixed-integer closed loops advanced together
     together_samples: int = 1200
     together_reference: Callable[[], Reference] = references.thesis
-    growth: tuple[tuple[str, tuple[int, ...]], ...] = (
+    growth: tuple[tuple[str, tuple[int, ...]], ...] = (  # sizes, of the horizon [samples]
         ("horizon", (60, 125, 250, 500)),
         ("blocks", (4, 8, 16, 32)),
         ("CVs", (1, 2, 4, 8)),
         ("MVs", (1, 2, 4, 8)),
     )
-    startup_modes: tuple[Mode, ...] = MODES
-    sweep_chunks: int = 2
+    startup_modes: tuple[Mode, ...] = MODES  # blocking modes whose first call is measured
+    sweep_chunks: int = 2  # of the sweep whose overhead is measured
     sweep_samples: int = 600
-    sweep_stored: int = 10_000
-    sweep_scanned: int = 1000
-    sweep_memory: tuple[int, int] = (8, 80)
+    sweep_stored: int = 10_000  # scenarios of the store that is opened
+    sweep_scanned: int = 1000  # chunks of the store that is resumed
+    sweep_memory: tuple[int, int] = (8, 80)  # chunks of the two sweeps whose memory is compared
 
 
 FULL = Size()
@@ -75,9 +56,7 @@ QUICK = Size(
     batches=(1, 512),
     peer_share=0.12,
     cut_off=5.0,
-    variants=256,
     variant_samples=300,
-    together=64,
     together_samples=120,
     together_reference=references.quick,
     growth=(("horizon", (60,)), ("blocks", (4,)), ("CVs", (4,)), ("MVs", (4,))),
@@ -92,21 +71,14 @@ QUICK = Size(
 
 @dataclasses.dataclass
 class Context:
-    """Shared by the sections of one call.
+    """Shared by the sections of one call."""
 
-    Attributes:
-        size: how much is measured.
-        quick: whether the reference is the short one.
-        say: receives a line of progress.
-        qp_peers, miqp_peers: solvers beside us.
-        series: numbers for figures, filled by the sections.
-    """
-
-    size: Size
-    quick: bool
-    say: Callable[[str], None]
+    size: Size  # how much is measured
+    quick: bool  # whether the reference is the short one
+    say: Callable[[str], None]  # receives a line of progress
     qp_peers: tuple[Peer, ...]
     miqp_peers: tuple[Peer, ...]
+    # for figures, filled by the sections
     series: dict[str, dict[str, list[float]]] = dataclasses.field(default_factory=dict)
 
     @functools.cached_property

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -22,28 +23,18 @@ class Form:
     """min z'Pz / 2 + c'z, row_low <= A z <= row_high, low <= z <= high, some z integer.
 
     Every variable is divided by a unit that keeps its size near one.
-
-    Attributes:
-        P: Hessian, sparse by columns ``"variable variable"``.
-        c: linear cost.
-        A: rows, sparse by rows ``"row variable"``.
-        row_low, row_high: their limits, equal for equations.
-        low, high: limits of the variables, infinite for none.
-        starts: ``"block mv"``, where the moves of a plan are.
-        units: of the moves, ``"mv"`` [MV unit].
-        integer: ``"mv"``, whether the MV makes whole moves.
     """
 
-    P: Any
-    c: np.ndarray
-    A: Any
-    row_low: np.ndarray
+    P: Any  # Hessian, sparse by columns "variable variable"
+    c: np.ndarray  # linear cost
+    A: Any  # rows, sparse by rows "row variable"
+    row_low: np.ndarray  # their limits, equal for equations
     row_high: np.ndarray
-    low: np.ndarray
+    low: np.ndarray  # limits of the variables, infinite for none
     high: np.ndarray
-    starts: np.ndarray
-    units: np.ndarray
-    integer: np.ndarray
+    starts: np.ndarray  # "block mv", where the moves of a plan are
+    units: np.ndarray  # of the moves, "mv" [MV unit]
+    integer: np.ndarray  # "mv", whether the MV makes whole moves
 
     def scaled(self) -> Form:
         """The same problem with its cost divided by the largest entry of P, for solvers with absolute tolerances."""
@@ -234,18 +225,8 @@ def same_matrices(one: Form | None, other: Form) -> bool:
     return all(np.array_equal(a, b) for a, b in zip(matrices(one), matrices(other), strict=True))
 
 
-class Binaries(NamedTuple):
-    """Integers written as their lower limit plus binaries: z = back @ x + base."""
-
-    back: sp.csr_matrix
-    base: np.ndarray
-    binary: np.ndarray
-
-
-def binaries_of(form: Form) -> tuple[Form, Binaries | None]:
-    """The form with every integer as a sum of binaries; untouched where there are none."""
-    if not len(form.integers):
-        return form, None
+def binaries_of(form: Form) -> tuple[Form, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+    """The form with every integer as its lower limit plus binaries, their positions, and the way back to its variables."""
     base = np.zeros(len(form.c))
     base[form.integers] = form.low[form.integers]
     ranges = (form.high - form.low)[form.integers].astype(int)
@@ -263,4 +244,4 @@ def binaries_of(form: Form) -> tuple[Form, Binaries | None]:
         low=np.r_[form.low[kept], np.zeros(len(binary))],
         high=np.r_[form.high[kept], np.ones(len(binary))],
     )
-    return changed, Binaries(back, base, binary)
+    return changed, binary, lambda z: back @ z + base

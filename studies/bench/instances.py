@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import io
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -30,6 +29,7 @@ from jaxmpc.process.plant import WellPlant
 from jaxmpc.process.well.equations import well_hash
 from jaxmpc.process.well.host import HostWell
 from jaxmpc.programs.cache import cache_folder, read_sealed, sealed
+from studies.bench.judge import taken
 from studies.definition import presets
 from studies.store.fingerprint import content_hash
 
@@ -38,34 +38,23 @@ Mode = Literal["moves", "inputs"]
 MODES: tuple[Mode, ...] = ("moves", "inputs")
 RECORDING_FORMAT = 2
 WARM_UP = 20  # samples before the clock of a run starts
-FIELDS = ("setpoint", "cv", "move", "mv_demand", "gap", "fallback", "solve_time")
 
 
-@dataclasses.dataclass(frozen=True)
-class Recording:
-    """What a closed-loop run leaves for the benchmark, time first.
+class Recording(NamedTuple):
+    """What a closed-loop run leaves for the benchmark, time first."""
 
-    Attributes:
-        setpoint, cv: ``"sample cv"`` [CV unit].
-        move, mv_demand: ``"sample mv"`` [MV unit].
-        gap: ``"sample"``, relative gap of the plan.
-        fallback: ``"sample"``, whether there was no plan.
-        solve_time: ``"sample"`` [s].
-        wall_time: of the run, plant included, first compilation not [s].
-    """
-
-    setpoint: np.ndarray
-    cv: np.ndarray
-    move: np.ndarray
-    mv_demand: np.ndarray
-    gap: np.ndarray
-    fallback: np.ndarray
-    solve_time: np.ndarray
-    wall_time: float
+    setpoint: np.ndarray  # "sample cv" [CV unit]
+    cv: np.ndarray  # "sample cv" [CV unit]
+    move: np.ndarray  # "sample mv" [MV unit]
+    mv_demand: np.ndarray  # "sample mv" [MV unit]
+    gap: np.ndarray  # "sample", relative gap of the plan
+    fallback: np.ndarray  # "sample", whether there was no plan
+    solve_time: np.ndarray  # "sample" [s]
+    wall_time: float  # of the run, plant included, first compilation not [s]
 
 
 class Problems(NamedTuple):
-    """Problems of single samples, ``"problem"`` first; values as `jaxmpc.problem.condense.make_instance` takes them."""
+    """Problems of single samples, ``"problem"`` first; values as `jaxmpc.problem.instance.make_instance` takes them."""
 
     free_response: np.ndarray
     setpoint: np.ndarray
@@ -84,30 +73,23 @@ class Problems(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Instances:
-    """Recorded problems with those of the sample before, which a warm start comes from.
-
-    Attributes:
-        structure, tuning, model: of the controller.
-        sample: ``"problem"``, where in the run they are.
-        now, before: the problems, and those one sample earlier.
-    """
+    """Recorded problems with those of the sample before, which a warm start comes from."""
 
     structure: Structure
     tuning: Tuning
     model: StepResponseModel
-    sample: np.ndarray
+    sample: np.ndarray  # "problem", where in the run they are
     now: Problems
-    before: Problems
+    before: Problems  # those one sample earlier
 
     def __len__(self) -> int:
         return len(self.sample)
 
     def cases(self) -> list[dict[str, Any]]:
-        """The contents of all case files."""
-        return [self.case(i) for i in range(len(self))]
+        """The contents of case files, with the limits of the first move that the mean-move limit (6.6) sets."""
+        return [self._case(i) for i in range(len(self))]
 
-    def case(self, i: int) -> dict[str, Any]:
-        """The content of a case file, with the limits of the first move that the mean-move limit (6.6) sets."""
+    def _case(self, i: int) -> dict[str, Any]:
         problem = self.now.at(i)
         past = problem.pop("past_moves")
         body = case_to_dict(Case(self.model, self.structure, self.tuning, **problem))
@@ -123,26 +105,15 @@ def make_controller(kind: Kind, mode: Mode, model: StepResponseModel) -> Control
     return Controller(structure, presets.tuning(structure), model)
 
 
+@dataclasses.dataclass
 class Recordings:
-    """Recordings of one benchmark run: from this run, from the cache, or made now.
+    """Recordings of one benchmark run: from this run, from the cache, or made now."""
 
-    Args:
-        model: prediction model of every controller.
-        reference: setpoints of the runs.
-        samples: length of the runs, None for the whole reference.
-        say: receives a line per recording.
-    """
-
-    def __init__(
-        self,
-        model: StepResponseModel,
-        reference: Reference,
-        samples: int | None = None,
-        say: Callable[[str], None] = lambda line: None,
-    ):
-        self.model, self.reference, self.samples, self.say = model, reference, samples, say
-        self._live: dict[tuple[Kind, Mode], Recording] = {}
-        self._kept: dict[tuple[Kind, Mode], Recording] = {}
+    model: StepResponseModel  # of every controller
+    reference: Reference  # setpoints of the runs
+    samples: int | None = None  # length of the runs, None for the whole reference
+    say: Callable[[str], None] = lambda line: None  # receives a line per recording
+    _live: dict[tuple[Kind, Mode], Recording] = dataclasses.field(default_factory=dict)
 
     def live(self, kind: Kind, mode: Mode) -> Recording:
         """The run made now, once per benchmark: its times are of this machine and code."""
@@ -153,7 +124,7 @@ class Recordings:
             path = self.path(kind, mode)
             if _load(path) is None:
                 buffer = io.BytesIO()
-                np.savez_compressed(buffer, **dataclasses.asdict(made))
+                np.savez_compressed(buffer, **made._asdict())
                 write_atomically(path, sealed(buffer.getvalue()))
         return self._live[kind, mode]
 
@@ -166,10 +137,8 @@ class Recordings:
         """A run after one of a few samples, which compiles."""
         controller = make_controller(kind, mode, self.model)
         simulate(controller, plant, self.reference, samples=WARM_UP)
-        begin = time.perf_counter()
-        run = simulate(controller, plant, self.reference, samples=self.samples)
-        wall_time = time.perf_counter() - begin
-        return Recording(**{name: getattr(run, name) for name in FIELDS}, wall_time=wall_time)
+        seconds, run = taken(lambda: simulate(controller, plant, self.reference, samples=self.samples))
+        return Recording(*(getattr(run, name) for name in Recording._fields[:-1]), wall_time=seconds)
 
     def path(self, kind: Kind, mode: Mode) -> Path:
         """File of a recording, named by its content key."""
@@ -188,20 +157,11 @@ class Recordings:
 
     def kept(self, kind: Kind, mode: Mode) -> Recording:
         """The recording in the cache, else the run made now; its problems stay the same from run to run."""
-        if (kind, mode) not in self._kept:
-            stored = _load(self.path(kind, mode))
-            self._kept[kind, mode] = stored if stored is not None else self.live(kind, mode)
-        return self._kept[kind, mode]
+        stored = _load(self.path(kind, mode))
+        return self.live(kind, mode) if stored is None else stored
 
     def instances(self, kind: Kind, mode: Mode, count: int, *, hardest: bool = False) -> Instances:
-        """Problems spread evenly over a recorded run, or the ones that took longest.
-
-        Args:
-            kind: of the controller.
-            mode: blocking mode.
-            count: how many at most.
-            hardest: take the longest solves in place of evenly spread ones.
-        """
+        """At most `count` problems, spread evenly over a recorded run or the ones that took longest."""
         recording = self.kept(kind, mode)
         usable = np.arange(2, len(recording.cv))
         if hardest:
@@ -209,24 +169,12 @@ class Recordings:
         else:
             chosen = usable[np.unique(np.linspace(0, len(usable) - 1, count + 2).astype(int)[1:-1])]
         controller = make_controller(kind, mode, self.model)
-        problems = replay(controller, recording)
-        return Instances(
-            controller.structure,
-            controller.tuning,
-            self.model,
-            chosen,
-            problems.take(chosen),
-            problems.take(chosen - 1),
-        )
+        of, problems = (controller.structure, controller.tuning, self.model), replay(controller, recording)
+        return Instances(*of, chosen, problems.take(chosen), problems.take(chosen - 1))
 
 
 def replay(controller: Controller, recording: Recording) -> Problems:
-    """The problem of every sample of a recording, without solving any.
-
-    Args:
-        controller: the one that made the recording.
-        recording: its run.
-    """
+    """The problem of every sample of a recording that the controller made, without solving any."""
     core, structure = controller.core, controller.structure
     start = controller.init(recording.cv[0], recording.mv_demand[0] - recording.move[0])
     nothing = jnp.zeros((core.size.blocks, core.size.mvs))
@@ -253,4 +201,4 @@ def _load(path: Path) -> Recording | None:
     if content is None:
         return None
     with np.load(io.BytesIO(content)) as stored:
-        return Recording(**{name: stored[name] for name in FIELDS}, wall_time=float(stored["wall_time"]))
+        return Recording(*(stored[name][()] for name in Recording._fields))

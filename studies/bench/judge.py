@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -28,11 +27,7 @@ def taken(call: Callable[[], T]) -> tuple[float, T]:
 
 
 def repeated(measure: Callable[[], tuple[float, T]]) -> tuple[float, T]:
-    """The median of three measured times where one is short, and the last result.
-
-    Args:
-        measure: seconds and result of one call; blocks until the result is there.
-    """
+    """The median of three measured times where one is short, and the last result; `measure` blocks until it is there."""
     times: list[float] = []
     while True:
         seconds, result = measure()
@@ -43,31 +38,22 @@ def repeated(measure: Callable[[], tuple[float, T]]) -> tuple[float, T]:
 
 def time_each(solve: Callable[[S], T], problems: Iterable[S]) -> tuple[np.ndarray, list[T]]:
     """Time and result of every problem, ``"problem"`` [s]; `repeated` says how."""
-    found = [repeated(functools.partial(taken, functools.partial(solve, one))) for one in problems]
+    found = [repeated(lambda one=one: taken(lambda: solve(one))) for one in problems]
     return np.array([seconds for seconds, _ in found]), [result for _, result in found]
 
 
 class Judge:
-    """Judges plans of a list of problems: (6.6) straight from the equations, against the best plan anyone found.
+    """Judges plans of a list of problems: (6.6) straight from the equations, against the best plan anyone found."""
 
-    Args:
-        cases: contents of case files, see `instances.Instances.case`.
-    """
-
-    def __init__(self, cases: Sequence[dict]):
+    def __init__(self, cases: Sequence[dict]):  # as `instances.Instances.cases` makes them
         self.cases = list(cases)
         self.best = np.full(len(self.cases), math.inf)
         self._seen: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
-    def hear(
-        self, who: str, plans: Sequence[np.ndarray | None], at: Sequence[int] | np.ndarray | None = None
-    ) -> None:
-        """Take plans in; the cheapest feasible one of each problem is the reference of all.
+    def hear(self, who: str, plans: Sequence[np.ndarray | None], at: Any = None) -> None:
+        """Take plans ``"block mv"`` [MV unit] in, of the problems at some positions or of the first ones.
 
-        Args:
-            who: found them.
-            plans: ``"block mv"`` [MV unit] each, None for none.
-            at: positions of the problems; the first ones if not given.
+        The cheapest feasible one of each problem is the reference of all.
         """
         where = np.arange(len(plans)) if at is None else np.asarray(at, dtype=int)
         costs, wrongs = np.full(len(plans), math.nan), np.full(len(plans), math.nan)
@@ -85,16 +71,3 @@ class Judge:
         with np.errstate(invalid="ignore"):
             excess = np.abs(costs - best) / np.maximum(np.abs(best), LEAST_COST)
         return np.where(np.isnan(costs), math.nan, np.maximum(excess, wrongs))
-
-
-def ratio(ours: np.ndarray, theirs: np.ndarray, common: np.ndarray) -> float | None:
-    """How many times as fast we are by the medians of the problems that both were given.
-
-    Args:
-        ours: seconds of all problems.
-        theirs: seconds of the problems in `common`.
-        common: their positions.
-    """
-    if not len(common):
-        return None
-    return float(np.median(theirs) / np.median(ours[common]))

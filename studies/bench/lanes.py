@@ -17,25 +17,15 @@ from jaxmpc.relaxed.solve import cold_start, shifted_start, solve_relaxed
 from studies.bench.instances import Instances, Problems
 
 
-@jax.jit
-def _solve_one(qp, instance, start) -> QpSolution:
+def _solve(qp, instance, start) -> QpSolution:
     return solve_relaxed(qp, instance, instance.lower, instance.upper, start)
 
 
-@jax.jit
-def _solve_many(qp, instances, starts) -> QpSolution:
-    def lane(instance, start):
-        return solve_relaxed(qp, instance, instance.lower, instance.upper, start)
-
-    return jax.vmap(lane)(instances, starts)
+_solve_one, _solve_many = jax.jit(_solve), jax.jit(jax.vmap(_solve, in_axes=(None, 0, 0)))
 
 
 class Lanes:
-    """The relaxed problems of recorded samples, ready to be solved one at a time or as a batch.
-
-    Args:
-        instances: of a continuous controller.
-    """
+    """The relaxed problems of a continuous controller, ready to be solved one at a time or as a batch."""
 
     def __init__(self, instances: Instances):
         self.structure = instances.structure
@@ -47,26 +37,13 @@ class Lanes:
         self._before = instances.before
 
     def _build(self, problems: Problems):
-        core = self.core
-        free, setpoint, now, last, past = (np.asarray(values) for values in problems)
-        whole = self.controller.lanes.over_horizon
-        past = np.pad(past, ((0, 0), (core.size.past - past.shape[1], 0), (0, 0)))
-
-        def one(free, setpoint, now, last, past):
-            return make_instance(
-                core.layout,
-                core.size,
-                core.tuning,
-                core.qp,
-                free_response=free,
-                setpoint=setpoint,
-                mv_now=now,
-                last_move=last,
-                past_moves=past,
-                recover=True,
-            )
-
-        return jax.jit(jax.vmap(one))(whole(free), whole(setpoint), now, last, past)
+        core, given = self.core, problems._asdict()
+        for name in ("free_response", "setpoint"):
+            given[name] = self.controller.lanes.over_horizon(given[name])
+        earlier = core.size.past - given["past_moves"].shape[1]
+        given["past_moves"] = np.pad(given["past_moves"], ((0, 0), (earlier, 0), (0, 0)))
+        make = functools.partial(make_instance, core.layout, core.size, core.tuning, core.qp, recover=True)
+        return jax.jit(jax.vmap(lambda one: make(**one)))(given)
 
     @functools.cached_property
     def warm(self) -> Any:

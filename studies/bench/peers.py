@@ -28,19 +28,12 @@ HUGE = 1e30  # what solvers without infinity call infinite
 
 @dataclasses.dataclass
 class PeerAnswer:
-    """What a peer found.
+    """What a peer found."""
 
-    Attributes:
-        status: ``optimal``, ``limit``, ``infeasible`` or ``failed``.
-        z: variables of the form, None without a point.
-        bound: the solver's own lower bound of the cost without constants.
-        seconds: what its own work took [s].
-    """
-
-    status: str
-    z: np.ndarray | None = None
-    bound: float = -math.inf
-    seconds: float = math.nan
+    status: str  # optimal, limit, infeasible or failed
+    z: np.ndarray | None = None  # variables of the form, None without a point
+    bound: float = -math.inf  # the solver's own lower bound of the cost without constants
+    seconds: float = math.nan  # what its own work took [s]
 
 
 Solve = Callable[[Form], PeerAnswer]
@@ -48,27 +41,16 @@ Solve = Callable[[Form], PeerAnswer]
 
 @dataclasses.dataclass(frozen=True)
 class Peer:
-    """A solver that the benchmark compares with.
+    """A solver that the benchmark compares with."""
 
-    Attributes:
-        name: as printed.
-        package: distribution on the package index that brings it, imported under the same name.
-        build: the form it is fastest with.
-        begin: ``(tolerance, seconds per solve) -> solve``; keeps what it may keep between samples.
-        timed: what its time covers, for the table.
-        keeps: whether it is set up once for samples with equal matrices.
-        limit: samples it is asked at most, because it is slow.
-        hopeless: seconds after which one solve is cut off.
-    """
-
-    name: str
-    package: str
-    build: Callable[[dict], Form]
-    begin: Callable[[float, float], Solve]
-    timed: str
-    keeps: bool = False
-    limit: int = 10_000
-    hopeless: float = 10.0
+    name: str  # as printed
+    package: str  # distribution on the package index that brings it, imported under the same name
+    build: Callable[[dict], Form]  # the form it is fastest with
+    begin: Callable[[float, float], Solve]  # with tolerance and seconds per solve; keeps what samples share
+    timed: str  # what its time covers, for the table
+    keeps: bool = False  # whether it is set up once for samples with equal matrices
+    limit: int = 10_000  # samples it is asked at most, because it is slow
+    hopeless: float = 10.0  # seconds after which one solve is cut off
 
     def missing(self) -> str | None:
         """Why it cannot be used, None if it can."""
@@ -84,22 +66,23 @@ class Peer:
             return "?"
 
 
+def anew(solve: Callable[[Form, float, float], PeerAnswer]) -> Callable[[float, float], Solve]:
+    """The `Peer.begin` of a solver that keeps nothing between samples."""
+    return lambda tolerance, seconds: lambda form: solve(form, tolerance, seconds)
+
+
 # ------------------------------------------------------------------------------------------------ relaxed QPs
 
 
+@dataclasses.dataclass
 class _Kept:
-    """A solver that is set up once for samples with equal matrices, and only given their vectors from then on.
+    """A solver that is set up once for samples with equal matrices, and only given their vectors from then on."""
 
-    Args:
-        setup: makes a solver of a form and its data.
-        update: gives the vectors of the data to one.
-        run: solves; returns what it found.
-    """
-
-    def __init__(self, setup: Callable[..., Any], update: Callable[..., object], run: Callable[[Any], Any]):
-        self.setup, self.update, self.run = setup, update, run
-        self.form: Form | None = None
-        self.solver: Any = None
+    setup: Callable[..., Any]  # makes a solver of a form and its data
+    update: Callable[..., object]  # gives the vectors of the data to one
+    run: Callable[[Any], Any]  # solves; returns what it found
+    form: Form | None = None
+    solver: Any = None
 
     def __call__(self, form: Form, *data: Any) -> tuple[float, Any]:
         """Seconds of the solver's own work, and what it found."""
@@ -213,41 +196,34 @@ def osqp(tolerance: float, seconds: float) -> Solve:
     return solve
 
 
-def daqp(tolerance: float, seconds: float) -> Solve:
+@anew
+def daqp(form: Form, tolerance: float, seconds: float) -> PeerAnswer:
     """DAQP: dual active set on dense matrices; integers become binaries that it branches on."""
     import daqp
 
-    def solve(form: Form) -> PeerAnswer:
-        form, spread = binaries_of(form)
-        A, b, G, low, high = rows_of(form)
-        rows = np.ascontiguousarray(sp.vstack([A, G]).toarray())
-        lower = np.clip(np.r_[form.low, b, low], -HUGE, None)
-        upper = np.clip(np.r_[form.high, b, high], None, HUGE)
-        sense = np.zeros(len(lower), dtype=np.int32)
-        sense[lower == upper] = 5  # an equation, always active
-        if spread is not None:
-            sense[spread.binary] = 16
-        hessian = np.ascontiguousarray(form.P.toarray())
-        options = dict(primal_tol=max(tolerance, 1e-10), dual_tol=1e-11, eps_prox=1e-4, iter_limit=100_000)
-        problem = hessian, form.c.copy(), rows, upper, lower, sense
-        elapsed, (x, _, flag, _) = taken(lambda: daqp.solve(*problem, time_limit=seconds, **options))
-        if flag not in (1, 2, 4):  # 4: solved, but its certificate is left open; the judge decides
-            return PeerAnswer("infeasible" if flag == -1 else "limit", seconds=elapsed)
-        z = np.array(x)[: len(form.c)]
-        return PeerAnswer("optimal", z if spread is None else spread.back @ z + spread.base, seconds=elapsed)
-
-    return solve
+    form, binary, back = binaries_of(form)
+    A, b, G, low, high = rows_of(form)
+    rows = np.ascontiguousarray(sp.vstack([A, G]).toarray())
+    lower = np.clip(np.r_[form.low, b, low], -HUGE, None)
+    upper = np.clip(np.r_[form.high, b, high], None, HUGE)
+    sense = np.zeros(len(lower), dtype=np.int32)
+    sense[lower == upper] = 5  # an equation, always active
+    sense[binary] = 16
+    hessian = np.ascontiguousarray(form.P.toarray())
+    options = dict(primal_tol=max(tolerance, 1e-10), dual_tol=1e-11, eps_prox=1e-4, iter_limit=100_000)
+    problem = hessian, form.c.copy(), rows, upper, lower, sense
+    elapsed, (x, _, flag, _) = taken(lambda: daqp.solve(*problem, time_limit=seconds, **options))
+    if flag not in (1, 2, 4):  # 4: solved, but its certificate is left open; the judge decides
+        return PeerAnswer("infeasible" if flag == -1 else "limit", seconds=elapsed)
+    return PeerAnswer("optimal", back(np.array(x)[: len(form.c)]), seconds=elapsed)
 
 
-def highs(tolerance: float, seconds: float) -> Solve:
+@anew
+def highs(form: Form, tolerance: float, seconds: float) -> PeerAnswer:
     """The QP solver of HiGHS: primal active set."""
-
-    def solve(form: Form) -> PeerAnswer:
-        data = form.P, form.c, form.A, form.row_low, form.row_high, form.low, form.high
-        elapsed, (status, z) = taken(lambda: highs_qp(*data, seconds=seconds))
-        return PeerAnswer(status, z, seconds=elapsed)
-
-    return solve
+    data = form.P, form.c, form.A, form.row_low, form.row_high, form.low, form.high
+    elapsed, (status, z) = taken(lambda: highs_qp(*data, seconds=seconds))
+    return PeerAnswer(status, z, seconds=elapsed)
 
 
 def qpax(tolerance: float, seconds: float) -> Solve:
@@ -284,53 +260,47 @@ def _standard(form: Form) -> tuple[Any, np.ndarray, int]:
 # ---------------------------------------------------------------------------------------------- exact MIQPs
 
 
-def scip(tolerance: float, seconds: float) -> Solve:
+@anew
+def scip(form: Form, tolerance: float, seconds: float) -> PeerAnswer:
     """SCIP: branch and cut; one epigraph variable per square, the tightest outer approximation. Needs a diagonal P."""
     import pyscipopt
 
-    def solve(form: Form) -> PeerAnswer:
-        model = pyscipopt.Model()
-        model.hideOutput()
-        limits = {"limits/time": seconds, "limits/gap": tolerance, "numerics/feastol": 1e-8}
-        for name, value in limits.items():
-            model.setParam(name, value)
-        integer = set(form.integers.tolist())
-        z = [
-            model.addVar(vtype="I" if i in integer else "C", lb=_finite(low), ub=_finite(high))
-            for i, (low, high) in enumerate(zip(form.low, form.high, strict=True))
-        ]
-        for row, low, high in zip(form.A, form.row_low, form.row_high, strict=True):
-            entries = zip(row.indices, row.data, strict=True)
-            terms = pyscipopt.quicksum(float(value) * z[k] for k, value in entries)
-            if low == high:
-                model.addCons(terms == low)
-                continue
-            if math.isfinite(low):
-                model.addCons(terms >= low)
-            if math.isfinite(high):
-                model.addCons(terms <= high)
-        total = pyscipopt.quicksum(float(form.c[i]) * z[i] for i in np.flatnonzero(form.c))
-        squares = form.P.diagonal() / 2
-        for i in np.flatnonzero(squares):
-            t = model.addVar(lb=0.0)
-            model.addCons(z[i] * z[i] <= t)
-            total += float(squares[i]) * t
-        model.setObjective(total, "minimize")
-        elapsed, _ = taken(model.optimize)
-        status, bound = model.getStatus(), model.getDualbound()
-        if status == "infeasible":
-            return PeerAnswer("infeasible", seconds=elapsed)
-        if model.getNSols() == 0:
-            return PeerAnswer("limit" if status == "timelimit" else "failed", bound=bound, seconds=elapsed)
-        point = np.array([model.getVal(variable) for variable in z])
-        done = status in ("optimal", "gaplimit")
-        return PeerAnswer("optimal" if done else "limit", point, bound, elapsed)
-
-    return solve
-
-
-def _finite(limit: float) -> float | None:
-    return limit if math.isfinite(limit) else None
+    model = pyscipopt.Model()
+    model.hideOutput()
+    limits = {"limits/time": seconds, "limits/gap": tolerance, "numerics/feastol": 1e-8}
+    for name, value in limits.items():
+        model.setParam(name, value)
+    kinds = np.full(len(form.c), "C")
+    kinds[form.integers] = "I"
+    finite = lambda limits: [limit if math.isfinite(limit) else None for limit in limits.tolist()]  # noqa: E731
+    ranges = zip(kinds.tolist(), finite(form.low), finite(form.high), strict=True)
+    z = [model.addVar(vtype=kind, lb=low, ub=high) for kind, low, high in ranges]
+    for row, low, high in zip(form.A, form.row_low, form.row_high, strict=True):
+        entries = zip(row.indices, row.data, strict=True)
+        terms = pyscipopt.quicksum(float(value) * z[k] for k, value in entries)
+        if low == high:
+            model.addCons(terms == low)
+            continue
+        if math.isfinite(low):
+            model.addCons(terms >= low)
+        if math.isfinite(high):
+            model.addCons(terms <= high)
+    total = pyscipopt.quicksum(float(form.c[i]) * z[i] for i in np.flatnonzero(form.c))
+    squares = form.P.diagonal() / 2
+    for i in np.flatnonzero(squares):
+        t = model.addVar(lb=0.0)
+        model.addCons(z[i] * z[i] <= t)
+        total += float(squares[i]) * t
+    model.setObjective(total, "minimize")
+    elapsed, _ = taken(model.optimize)
+    status, bound = model.getStatus(), model.getDualbound()
+    if status == "infeasible":
+        return PeerAnswer("infeasible", seconds=elapsed)
+    if model.getNSols() == 0:
+        return PeerAnswer("limit" if status == "timelimit" else "failed", bound=bound, seconds=elapsed)
+    point = np.array([model.getVal(variable) for variable in z])
+    done = status in ("optimal", "gaplimit")
+    return PeerAnswer("optimal" if done else "limit", point, bound, elapsed)
 
 
 def gurobi(tolerance: float, seconds: float) -> Solve:

@@ -3,27 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
 RIGHT = 1e-6  # relative error up to which a solution counts
-COLUMNS = (
-    "name",
-    "n",
-    "median ms",
-    "p99 ms",
-    "rate /s",
-    "total s",
-    "MB",
-    "ratio",
-    "worst error",
-    "floor",
-    "aim",
-    "met",
-)
 FORMAT = 1
 
 Quantity = Literal["median_ms", "p99_ms", "rate", "ratio", "seconds", "megabytes"]
@@ -36,20 +22,15 @@ _SHOWN = {
     "megabytes": "{} MB",
 }
 _LARGER_IS_BETTER = ("rate", "ratio")
+TEXTS = ("name", "floor", "aim", "met")  # columns of words; the others hold numbers
 
 
 class Goal(msgspec.Struct, frozen=True):
-    """What a row must reach.
+    """What a row must reach."""
 
-    Attributes:
-        quantity: field of the row.
-        floor: that must be reached.
-        aim: beyond the floor, None for none.
-    """
-
-    quantity: Quantity
-    floor: float
-    aim: float | None = None
+    quantity: Quantity  # field of the row
+    floor: float  # that must be reached
+    aim: float | None = None  # beyond the floor, None for none
 
     def met(self, row: Row) -> bool | None:
         """Whether the row reaches the floor with solutions that count; None where that is not known."""
@@ -64,54 +45,34 @@ class Goal(msgspec.Struct, frozen=True):
 
 
 class Row(msgspec.Struct, kw_only=True):
-    """One line of the benchmark.
+    """One line of the benchmark."""
 
-    Attributes:
-        name: what was measured.
-        section: that it belongs to.
-        status: ``measured``, ``missing`` (a peer that is not installed), ``failed`` or ``not measured``.
-        instances: problems that were tried, or samples of a run.
-        solved: how many of them have a solution that counts.
-        median_ms, p99_ms: time per problem [ms].
-        rate: problems per second.
-        seconds: of the whole, where that is what matters [s].
-        megabytes: peak memory of the process [MB].
-        ratio: how many times as fast as `ratio_to` on the problems that both were given.
-        ratio_to: the peer.
-        ratio_is_lower_bound: the peer was stopped at its time limit.
-        worst_error: largest error of the solutions, see `judge.error`; None where there are none.
-        counts: whether no solution is wrong by more than `RIGHT`.
-        goals: floors and aims.
-        note: how it was measured.
-    """
-
-    name: str
-    section: str
+    name: str  # what was measured
+    section: str = ""  # that it belongs to; `run` writes it
+    # measured, missing (a peer that is not installed), failed or not measured
     status: Literal["measured", "missing", "failed", "not measured"] = "measured"
-    instances: int | None = None
-    solved: int | None = None
-    median_ms: float | None = None
-    p99_ms: float | None = None
-    rate: float | None = None
-    seconds: float | None = None
-    megabytes: float | None = None
-    ratio: float | None = None
-    ratio_to: str | None = None
-    ratio_is_lower_bound: bool = False
+    instances: int | None = None  # problems that were tried, or samples of a run
+    solved: int | None = None  # how many of them have a solution that counts
+    median_ms: float | None = None  # per problem [ms]
+    p99_ms: float | None = None  # per problem [ms]
+    rate: float | None = None  # problems per second
+    seconds: float | None = None  # of the whole, where that is what matters [s]
+    megabytes: float | None = None  # peak memory of the process [MB]
+    ratio: float | None = None  # how many times as fast as `ratio_to` on the problems that both were given
+    ratio_to: str | None = None  # the peer
+    ratio_is_lower_bound: bool = False  # the peer was stopped at its time limit
+    # largest error of the solutions, see `judge.Judge.errors`; None where there are none
     worst_error: float | None = None
-    counts: bool = True
-    goals: tuple[Goal, ...] = ()
-    note: str = ""
+    counts: bool = True  # whether no solution is wrong by more than `RIGHT`
+    goals: tuple[Goal, ...] = ()  # floors and aims
+    note: str = ""  # how it was measured
 
 
-def timed(name: str, section: str, times: Sequence[float] | np.ndarray, errors: Any, **more: Any) -> Row:
-    """A row from the time and the error of every problem.
+def timed(name: str, times: Sequence[float] | np.ndarray, errors: Any, **more: Any) -> Row:
+    """A row from the time ``"problem"`` [s] and the error ``"problem"`` of every problem; NaN for one without a solution.
 
     Args:
-        name, section: of the row.
-        times: ``"problem"`` [s].
-        errors: ``"problem"``; not a number for a problem without a solution.
-        **more: further fields of `Row`, or others than follow from the times.
+        more: further fields of `Row`, or others than follow from the times.
     """
     times, errors = np.asarray(times, dtype=float), np.asarray(errors, dtype=float)
     found = errors[~np.isnan(errors)]
@@ -125,39 +86,24 @@ def timed(name: str, section: str, times: Sequence[float] | np.ndarray, errors: 
         "worst_error": worst,
         "counts": worst is not None and worst <= RIGHT,
     }
-    return Row(name=name, section=section, **{**fields, **more})
+    return Row(name=name, **{**fields, **more})
 
 
-def batched(name: str, section: str, seconds: float, count: int, errors: Any, **more: Any) -> Row:
-    """A row for `count` problems that were solved in one call; arguments as for `timed`, `seconds` of the call."""
-    fields = {"median_ms": seconds / count * 1e3, "p99_ms": None, "rate": count / seconds, "seconds": seconds}
-    return timed(name, section, [seconds], errors, **{**fields, **more})
-
-
-def whole(name: str, section: str, seconds: float, errors: Any, **more: Any) -> Row:
-    """A row of which only the seconds of the whole matter; arguments as for `timed`."""
-    fields = {"median_ms": None, "p99_ms": None, "rate": None, "seconds": seconds}
-    return timed(name, section, [seconds], errors, **{**fields, **more})
+def whole(name: str, seconds: float, errors: Any, count: int | None = None, **more: Any) -> Row:
+    """A row of which the seconds of the whole matter, and those of each problem where `count` were solved in one call."""
+    each = {"median_ms": count and seconds / count * 1e3, "rate": count and count / seconds}
+    return timed(name, [seconds], errors, **{**each, "p99_ms": None, "seconds": seconds, **more})
 
 
 class Report(msgspec.Struct, kw_only=True):
-    """Everything one call of the benchmark measured; the content of its JSON file.
+    """Everything one call of the benchmark measured; the content of its JSON file."""
 
-    Attributes:
-        format: of this file.
-        machine: cores, load, versions, devices.
-        options: of the call.
-        complete: False while it runs and after an interrupt.
-        rows: measured so far.
-        series: numbers over a run or over batch sizes, by name, for figures.
-    """
-
-    format: int = FORMAT
-    machine: dict[str, Any] = {}
-    options: dict[str, Any] = {}
-    complete: bool = False
+    format: int = FORMAT  # of this file
+    machine: dict[str, Any] = {}  # cores, load, versions, devices
+    options: dict[str, Any] = {}  # of the call
+    complete: bool = False  # False while it runs and after an interrupt
     rows: list[Row] = []
-    series: dict[str, dict[str, list[float]]] = {}
+    series: dict[str, dict[str, list[float]]] = {}  # over a run or over batch sizes, by name, for figures
 
     def to_json(self) -> str:
         """The JSON file, infinite and missing numbers as null, with whether each floor is met."""
@@ -171,23 +117,26 @@ class Report(msgspec.Struct, kw_only=True):
 def table(report: Report) -> str:
     """The rows as aligned text with the machine above and the notes below."""
     lines = [cells(row) for row in report.rows]
-    widths = [max(len(line[i]) for line in [COLUMNS, *lines]) for i in range(len(COLUMNS))]
-    left = (0, 9, 10, 11)  # text columns; the others hold numbers
+    head = list(cells(Row(name="")))
+    widths = [
+        max(len(text) for text in column)
+        for column in zip(head, *(line.values() for line in lines), strict=True)
+    ]
 
-    def shown(line: Sequence[str]) -> str:
-        cut = [
-            cell.ljust(w) if i in left else cell.rjust(w)
-            for i, (cell, w) in enumerate(zip(line, widths, strict=True))
-        ]
+    def shown(texts: Iterable[str]) -> str:
+        cut = (
+            text.ljust(width) if name in TEXTS else text.rjust(width)
+            for text, name, width in zip(texts, head, widths, strict=True)
+        )
         return "  ".join(cut).rstrip()
 
-    out = [machine_line(report.machine), "", shown(COLUMNS)]
+    out = [", ".join(f"{key} {value}" for key, value in report.machine.items()), "", shown(head)]
     section = None
     for row, line in zip(report.rows, lines, strict=True):
         if row.section != section:
             out.append("-" * (sum(widths) + 2 * (len(widths) - 1)))
             section = row.section
-        out.append(shown(line))
+        out.append(shown(line.values()))
     if any(not row.counts for row in report.rows):
         out += ["", f"! does not count: a solution is wrong by more than {RIGHT:g}, or there is none"]
     if any(row.ratio_is_lower_bound for row in report.rows):
@@ -202,37 +151,35 @@ def table(report: Report) -> str:
     return "\n".join(out) + "\n"
 
 
-def cells(row: Row) -> list[str]:
-    """The texts of one line."""
+def cells(row: Row) -> dict[str, str]:
+    """The texts of one line by the heads of their columns."""
     tried = "" if row.instances is None else str(row.instances)
     if row.solved is not None and row.solved != row.instances:
         tried = f"{row.solved} of {row.instances}"
-    ratio = (
-        ""
-        if row.ratio is None
-        else f"{'>= ' if row.ratio_is_lower_bound else ''}{number(row.ratio)}x {row.ratio_to}"
-    )
+    ratio = "" if row.ratio is None else f"{number(row.ratio)}x {row.ratio_to}"
     error = "" if row.worst_error is None else f"{row.worst_error:.0e}"
-    verdicts = [goal.met(row) for goal in row.goals]
-    words = [{None: "-", True: "met", False: "missed"}[verdict] for verdict in verdicts]
-    met = ", ".join(words if len(set(words)) > 1 else words[:1])
+    words = [{None: "-", True: "met", False: "missed"}[goal.met(row)] for goal in row.goals]
     if row.status != "measured":
         error = row.status
     elif not row.counts:
         error = f"! {error}".rstrip()
     elif row.solved == 0:
         error = "none solved"
-    aims = [goal for goal in row.goals if goal.aim is not None]
-    return [
-        row.name,
-        tried,
-        *(number(value) for value in (row.median_ms, row.p99_ms, row.rate, row.seconds, row.megabytes)),
-        ratio,
-        error,
-        ", ".join(_SHOWN[goal.quantity].format(number(goal.floor)) for goal in row.goals),
-        ", ".join(_SHOWN[goal.quantity].format(number(goal.aim)) for goal in aims),
-        met,
-    ]
+    said = lambda goal, value: _SHOWN[goal.quantity].format(number(value))  # noqa: E731
+    return {
+        "name": row.name,
+        "n": tried,
+        "median ms": number(row.median_ms),
+        "p99 ms": number(row.p99_ms),
+        "rate /s": number(row.rate),
+        "total s": number(row.seconds),
+        "MB": number(row.megabytes),
+        "ratio": ">= " * (row.ratio_is_lower_bound and bool(ratio)) + ratio,
+        "worst error": error,
+        "floor": ", ".join(said(goal, goal.floor) for goal in row.goals),
+        "aim": ", ".join(said(goal, goal.aim) for goal in row.goals if goal.aim is not None),
+        "met": ", ".join(words if len(set(words)) > 1 else words[:1]),
+    }
 
 
 def number(value: float | None) -> str:
@@ -240,8 +187,3 @@ def number(value: float | None) -> str:
     if value is None or not math.isfinite(value):
         return ""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
-
-
-def machine_line(machine: dict[str, Any]) -> str:
-    """The machine in one line."""
-    return ", ".join(f"{key} {value}" for key, value in machine.items())

@@ -9,13 +9,13 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
 from jaxmpc.programs.interrupts import last_words
 from studies.bench.context import FULL, QUICK, Context, Size
 from studies.bench.peers import MIQP_PEERS, QP_PEERS, Peer
 from studies.bench.rows import Report, Row, table
 from studies.bench.sections import exact, growth, loops, relaxed, startup, sweeps
+from studies.definition.refusing import require
 from studies.store.fingerprint import versions
 
 Section = Callable[[Context], Iterator[Row]]
@@ -32,20 +32,15 @@ SECTIONS: dict[str, Section] = {
 
 
 def chosen_sections(only: str | None) -> list[str]:
-    """Names of the sections to run, in their order.
-
-    Args:
-        only: names with commas between, None for all.
+    """Names of the sections to run, in their order, of names with commas between; None for all.
 
     Raises:
         InputError: for an unknown name or none at all.
     """
-    if only is None:
-        return list(SECTIONS)
-    names = [name.strip() for name in only.split(",")]
+    names = list(SECTIONS) if only is None else [name.strip() for name in only.split(",")]
     for name in names:
-        if name not in SECTIONS:
-            raise InputError("--only", name, f"sections with commas between, of {', '.join(SECTIONS)}")
+        expected = f"sections with commas between, of {', '.join(SECTIONS)}"
+        require(name in SECTIONS, "--only", name, expected)
     return [name for name in SECTIONS if name in names]
 
 
@@ -94,11 +89,11 @@ def run_bench(
         return ""
 
     with last_words(keep):
-        complete = True
+        ended = []
         for name in names:
-            complete &= _section(name, context, report)
+            ended.append(_section(name, context, report))
             _write(report, json_path)
-    report.complete = complete
+    report.complete = all(ended)
     _write(report, json_path)
     return report
 
@@ -107,13 +102,13 @@ def _section(name: str, context: Context, report: Report) -> bool:
     """Append the rows of a section; an error ends it with a row that says so. True if it came to its end."""
     try:
         for row in SECTIONS[name](context):
+            row.section = name
             report.rows.append(row)
     except Exception as error:  # one section must not cost the others their rows
         what = " ".join(f"{type(error).__name__}: {error}".split())
         context.say(f"{name} ended early: {what}")
-        report.rows.append(
-            Row(name=f"{name}: ended early", section=name, status="failed", counts=False, note=what)
-        )
+        row = Row(name=f"{name}: ended early", section=name, status="failed", counts=False, note=what)
+        report.rows.append(row)
         return False
     return True
 

@@ -12,10 +12,10 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from jaxmpc.errors import InputError
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
 from studies.definition import presets
+from studies.definition.refusing import located, require
 from studies.definition.sections import ReferenceDefinition as ReferenceDefinition
 
 PlantKind = Literal["fmu", "jax"]
@@ -96,12 +96,8 @@ class ControllerDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
         out, changes = [], dict(self.changes)
         for i, change in enumerate(self.then):
             changes |= change.changes
-            try:
-                tuning = presets.tuning(self.structure(), self.tuning, changes)
-            except InputError as error:
-                field = f"then[{i}].changes.{error.field.removeprefix('tuning.')}"
-                raise InputError(field, error.value, error.expected, error.hint) from None
-            out.append((change.at, tuning))
+            with located(lambda field, i=i: f"then[{i}].changes.{field.removeprefix('tuning.')}"):
+                out.append((change.at, presets.tuning(self.structure(), self.tuning, changes)))
         return tuple(out)
 
     def resolved(self) -> dict[str, Any]:
@@ -130,33 +126,21 @@ class ControllerDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
         Raises:
             InputError: naming the field, by its path in the controller.
         """
-        dt = self.structure().dt
         self.build_tuning()
         self.later_tunings()
-        before = 0.0
+        dt, before, earlier = self.structure().dt, 0.0, "the start"
+        last = duration - dt
         for i, change in enumerate(self.then):
-            earlier = "the start" if i == 0 else "the change before"
-            if not before + dt <= change.at <= duration - dt:
-                raise InputError(
-                    f"then[{i}].at",
-                    change.at,
-                    f"a time from {before + dt:g} s, a sample after {earlier}, to {duration - dt:g} s",
-                )
-            before = change.at
-        start = self.open_loop_from
-        if start is not None and not before <= start <= duration - dt:
-            raise InputError(
-                "open_loop_from",
-                start,
-                f"a time from {before:g} s, the last change of tuning, to {duration - dt:g} s",
-            )
-        if self.time_limit is not None:
-            if self.kind != "mixed-integer":
-                raise InputError(
-                    "time_limit", self.time_limit, "None: only mixed-integer controllers have limits"
-                )
-            if not 0 < self.time_limit < np.inf:
-                raise InputError("time_limit", self.time_limit, "a positive time of one step [s]")
+            expected = f"a time from {before + dt:g} s, a sample after {earlier}, to {last:g} s"
+            require(before + dt <= change.at <= last, f"then[{i}].at", change.at, expected)
+            before, earlier = change.at, "the change before"
+        start, limit = self.open_loop_from, self.time_limit
+        expected = f"a time from {before:g} s, the last change of tuning, to {last:g} s"
+        require(start is None or before <= start <= last, "open_loop_from", start, expected)
+        if limit is not None:
+            expected = "None: only mixed-integer controllers have limits"
+            require(self.kind == "mixed-integer", "time_limit", limit, expected)
+            require(0 < limit < np.inf, "time_limit", limit, "a positive time of one step [s]")
 
 
 def _fields(tuning: Tuning) -> dict[str, Any]:
@@ -193,32 +177,21 @@ class ComparisonDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
         Raises:
             InputError: naming the field.
         """
-        if self.plant not in PLANTS:
-            raise InputError("plant", self.plant, f"one of {', '.join(PLANTS)}")
+        require(self.plant in PLANTS, "plant", self.plant, f"one of {', '.join(PLANTS)}")
         names = [controller.name for controller in self.controllers]
-        if not names or len(set(names)) != len(names):
-            raise InputError("controllers", names, "one or more controllers with distinct names")
+        distinct = names and len(set(names)) == len(names)
+        require(distinct, "controllers", names, "one or more controllers with distinct names")
         reference = self.reference.build()
-        first = self.controllers[0].structure()
+        duration, dt = reference.duration, self.controllers[0].structure().dt
         for controller in self.controllers:
-            structure = controller.structure()
-            try:
-                controller.check(reference.duration)
-            except InputError as error:
-                field = f"controllers.{controller.name}.{error.field}"
-                raise InputError(field, error.value, error.expected, error.hint) from None
-            if structure.dt != first.dt:
-                raise InputError(
-                    f"controllers.{controller.name}.dt", structure.dt, f"{first.dt} s like the others"
-                )
-        if reference.samples(first.dt) < 1:
-            raise InputError("reference.duration", reference.duration, f"at least one sample of {first.dt} s")
+            own, path = controller.structure().dt, f"controllers.{controller.name}"
+            with located(lambda field, path=path: f"{path}.{field}"):
+                controller.check(duration)
+            require(own == dt, f"{path}.dt", own, f"{dt} s like the others")
+        require(reference.samples(dt) >= 1, "reference.duration", duration, f"at least one sample of {dt} s")
         last = -1.0
         for i, (start, offset) in enumerate(self.disturbance):
-            if not max(last, 0.0) <= start < reference.duration or start == last:
-                raise InputError(
-                    f"disturbance[{i}][0]", start, f"increasing times from 0 to {reference.duration:g} s"
-                )
-            if not np.isfinite(offset):
-                raise InputError(f"disturbance[{i}][1]", offset, "a finite pressure offset [bar]")
+            increasing = max(last, 0.0) <= start < duration and start != last
+            require(increasing, f"disturbance[{i}][0]", start, f"increasing times from 0 to {duration:g} s")
+            require(np.isfinite(offset), f"disturbance[{i}][1]", offset, "a finite pressure offset [bar]")
             last = start

@@ -9,140 +9,88 @@ from __future__ import annotations
 import dataclasses
 import statistics
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 # The table: measured on 2 CPU cores with chunks of 64 scenarios and the thesis tuning. Smaller chunks are slower per
 # scenario, and tunings that move the choke readily take several times as long.
 SAMPLES_PER_SECOND = {"continuous": 4000.0, "mixed-integer": 800.0}  # samples of one scenario
-COMPILE_SECONDS = 20.0  # more for the first chunk of a group
 MODEL_SECONDS = 1.0  # identification of one model
 
 
 def chunk_seconds(kind: str, samples: int, lanes: int) -> float:
-    """What the table expects of one chunk without compilation [s].
-
-    Args:
-        kind: of the controller.
-        samples: length of the run.
-        lanes: scenarios of the compiled program, padding included.
-    """
+    """What the table expects of one chunk [s], compilation never counted; `lanes` has its padding too."""
     return lanes * samples / SAMPLES_PER_SECOND[kind]
 
 
 @dataclasses.dataclass(frozen=True)
 class Work:
-    """The chunks of a study and what the table expects of them.
+    """The chunks of a study and what the table expects of them."""
 
-    Attributes:
-        groups: index of the group of every chunk.
-        kinds: kind of controller of every group.
-        seconds: `chunk_seconds` of every group [s].
-    """
-
-    groups: Sequence[int]
-    kinds: Sequence[str]
-    seconds: Sequence[float]
+    groups: Sequence[int]  # index of the group of every chunk
+    kinds: Sequence[str]  # kind of controller of every group
+    seconds: Sequence[float]  # `chunk_seconds` of every group [s]
 
     def costs(self, done: Mapping[int, Mapping[str, Any]]) -> list[float]:
-        """Seconds that one worker needs for a chunk of each group, without compilation.
+        """Seconds that one worker needs for a chunk of each group.
 
-        A group with stored chunks has their mean, without the first one of every process, which compiled; where there
-        are no others, `COMPILE_SECONDS` are taken off it. A group without any has what the table expects, times measured
-        over expected of groups with its kind of controller (of all groups, where none of its kind is measured).
+        A group with stored chunks has their mean. A group without any has what the table expects, times measured over
+        expected of groups with its kind of controller (of all groups, where none of its kind is measured).
 
         Args:
             done: facts of stored chunks, as `chunk.ChunkResult` has them; those without ``wall_time`` were not computed.
         """
-        times: dict[int, list[tuple[Any, float]]] = {}
+        times: dict[int, list[float]] = {}
         for chunk in sorted(done):
-            facts = done[chunk]
-            if "wall_time" in facts:
-                process = facts.get("host"), facts.get("process")
-                times.setdefault(self.groups[chunk], []).append((process, float(facts["wall_time"])))
-        measured = {group: _mean(pairs, self.seconds[group]) for group, pairs in times.items()}
+            if "wall_time" in done[chunk]:
+                times.setdefault(self.groups[chunk], []).append(float(done[chunk]["wall_time"]))
+        measured = {group: statistics.fmean(seconds) for group, seconds in times.items()}
         pace = {group: seconds / self.seconds[group] for group, seconds in measured.items()}
         costs = []
         for group, (kind, expected) in enumerate(zip(self.kinds, self.seconds, strict=True)):
-            alike = [value for other, value in pace.items() if self.kinds[other] == kind] or list(
-                pace.values()
-            )
-            factor = statistics.fmean(alike) if alike else 1.0
+            alike = [value for other, value in pace.items() if self.kinds[other] == kind]
+            factor = statistics.fmean(alike or pace.values() or [1.0])
             costs.append(measured.get(group, factor * expected))
         return costs
 
     def rest(self, done: Mapping[int, Mapping[str, Any]]) -> float:
-        """Seconds that one worker needs for all chunks that are not in `done`; groups without chunks compile first.
-
-        Args:
-            done: as for `costs`.
-        """
+        """Seconds that one worker needs for all chunks that are not in `done`, as for `costs`."""
         costs = self.costs(done)
-        missing = [group for chunk, group in enumerate(self.groups) if chunk not in done]
-        compiled = {self.groups[chunk] for chunk, facts in done.items() if "wall_time" in facts}
-        return sum(costs[group] for group in missing) + COMPILE_SECONDS * len(set(missing) - compiled)
-
-
-def _mean(pairs: Iterable[tuple[Any, float]], expected: float) -> float:
-    """Mean time of chunks without compilation."""
-    seen, later, every = set(), [], []
-    for process, seconds in pairs:
-        every.append(seconds)
-        if process in seen:
-            later.append(seconds)
-        seen.add(process)
-    if later:
-        return statistics.fmean(later)
-    mean = statistics.fmean(every)
-    return min(mean, max(mean - COMPILE_SECONDS, expected))
+        return sum(costs[group] for chunk, group in enumerate(self.groups) if chunk not in done)
 
 
 @dataclasses.dataclass(frozen=True)
 class Description:
-    """What a run would do; see `scenarios.Study.describe`.
-
-    Attributes:
-        name: of the study.
-        scenarios: how many.
-        group_sizes: scenarios of every group.
-        chunks: how many.
-        compilations: compiled programs, one per group.
-        models: step-response models to identify.
-        samples: samples of all scenarios together.
-        stored_bytes: key figures and trajectories before compression [B].
-        seconds: rough time on 2 CPU cores [s]: identification, and what the table says of the chunks.
-        searched: whether each chunk is a batch that is asked for after the one before.
-    """
+    """What a run would do; see `scenarios.Study.describe`."""
 
     name: str
     scenarios: int
-    group_sizes: tuple[int, ...]
+    group_sizes: tuple[int, ...]  # scenarios of every group
     chunks: int
-    compilations: int
-    models: int
-    samples: int
-    stored_bytes: int
-    seconds: float
-    searched: bool = False
+    compilations: int  # compiled programs; groups of one size share theirs
+    models: int  # step-response models to identify
+    samples: int  # samples of all scenarios together
+    stored_bytes: int  # key figures and trajectories before compression [B]
+    seconds: float  # rough time on 2 CPU cores [s]: identification, and what the table says of the chunks
+    searched: bool = False  # whether each chunk is a batch that is asked for after the one before
 
     def __str__(self) -> str:
-        sizes = ", ".join(str(size) for size in self.group_sizes[:12])
-        more = ", ..." if len(self.group_sizes) > 12 else ""
+        sizes, minutes = self.group_sizes, f"{self.seconds / 60:.1f} minutes"
+        listed = ", ".join(map(str, sizes[:12])) + (", ..." if len(sizes) > 12 else "")
         batches = f"{self.chunks} batches of {self.scenarios // self.chunks} scenarios"
-        return "\n".join(
-            (
-                f"study       {self.name}",
-                f"scenarios   {self.scenarios} ({self.samples} samples in all)",
-                f"search      {batches}, each asked after the one before"
-                if self.searched
-                else f"groups      {len(self.group_sizes)} of equal structure and length, of {sizes}{more} scenarios",
-                f"chunks      {self.chunks}",
-                f"to compile  {self.compilations}",
-                f"models      {self.models} to identify",
-                f"stored      {megabytes(self.stored_bytes)} before compression",
-                f"time        about {self.seconds / 60:.1f} minutes on 2 CPU cores; the run measures it by its own chunks",
-            )
-        )
+        lines = {
+            "study": self.name,
+            "scenarios": f"{self.scenarios} ({self.samples} samples in all)",
+            "search": f"{batches}, each asked after the one before",
+            "groups": f"{len(sizes)} of equal structure and length, of {listed} scenarios",
+            "chunks": self.chunks,
+            "to compile": self.compilations,
+            "models": f"{self.models} to identify",
+            "stored": f"{megabytes(self.stored_bytes)} before compression",
+            "time": f"about {minutes} on 2 CPU cores; the run measures it by its own chunks",
+        }
+        del lines["groups" if self.searched else "search"]
+        return "\n".join(f"{what:<12}{said}" for what, said in lines.items())
 
 
 class Pace:
@@ -154,13 +102,7 @@ class Pace:
     def __init__(
         self, work: Work, done: Mapping[int, Mapping[str, Any]], clock: Callable[[], float] = time.monotonic
     ):
-        """Start the clock.
-
-        Args:
-            work: of the study.
-            done: facts of the chunks that are stored already.
-            clock: seconds that pass.
-        """
+        """Start the clock; `done` are the facts of the chunks that are stored already."""
         self._work, self._done, self._clock = work, dict(done), clock
         self._begin, self._computed = clock(), 0.0
 

@@ -27,29 +27,17 @@ Kind = Literal["number", "whole", "flag", "text", "lengths"]
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """One key.
+    """One key."""
 
-    Attributes:
-        key: its path below ``[base]``.
-        label: what it is, for legends and tables.
-        unit: of a number ("1" without unit, "" for what is not a number).
-        kind: ``number``, ``whole`` number, ``flag`` (true or false), ``text``, or ``lengths`` (of blocks).
-        default: what holds where nothing is given; None where another key or the preset decides.
-        choices: the texts that are accepted, where there are few.
-        shape: whether it fixes the shape of the compiled program.
-        infinite: whether infinity is accepted, as a limit that does not bind.
-        low, high: accepted range, as far as it does not follow from the typed objects.
-    """
-
-    key: str
-    label: str
-    unit: str
-    kind: Kind = "number"
-    default: Any = None
-    choices: tuple[str, ...] = ()
-    shape: bool = False
-    infinite: bool = False
-    low: float = -math.inf
+    key: str  # its path below [base]
+    label: str  # what it is, for legends and tables
+    unit: str  # of a number ("1" without unit, "" for what is not a number)
+    kind: Kind = "number"  # number, whole number, flag (true or false), text, or lengths (of blocks)
+    default: Any = None  # what holds where nothing is given; None where another key or the preset decides
+    choices: tuple[str, ...] = ()  # the texts that are accepted, where there are few
+    shape: bool = False  # whether it fixes the shape of the compiled program
+    infinite: bool = False  # whether infinity is accepted, as a limit that does not bind
+    low: float = -math.inf  # accepted range, as far as it does not follow from the typed objects
     high: float = math.inf
 
     @property
@@ -66,9 +54,7 @@ class Field:
             return "one of " + ", ".join(self.choices)
         if self.kind == "lengths":
             return f"lengths of blocks in whole samples, 1 or more and {LONGEST} together at most, such as [1, 1, 2, 4]"
-        words = (
-            "a whole number" if self.kind == "whole" else "a number" if self.infinite else "a finite number"
-        )
+        words = "a whole number" if self.kind == "whole" else f"a {'' if self.infinite else 'finite '}number"
         if self.low > -math.inf:
             bounded = self.high < LARGEST
             words += f" from {self.low:.10g} to {self.high:.10g}" if bounded else f" of {self.low:g} or more"
@@ -86,10 +72,8 @@ class Field:
             good = isinstance(value, str) and value in self.choices
             hint = near(value, self.choices) if not good else ""
         elif self.kind == "lengths":
-            good = isinstance(value, (list, tuple)) and all(
-                isinstance(v, int) and v is not True and v >= 1 for v in value
-            )
-            good = good and 1 <= sum(value) <= LONGEST
+            good = isinstance(value, (list, tuple)) and not any(isinstance(v, bool) for v in value)
+            good = good and all(isinstance(v, int) and v >= 1 for v in value) and 1 <= sum(value) <= LONGEST
         elif isinstance(value, bool) or not isinstance(value, (int, float)):
             good = False
         elif isinstance(value, int) and value.bit_length() > 63:  # no float has room for some of them
@@ -101,8 +85,7 @@ class Field:
                 good, hint = False, f"Numbers go up to {LARGEST:g}"
         if not good:
             raise InputError(path, shown, f"{self.expected} for {self.key}", hint)
-        plain = {"whole": int, "number": float, "lengths": tuple}.get(self.kind)
-        return plain(value) if plain else value
+        return {"whole": int, "number": float, "lengths": tuple}.get(self.kind, lambda same: same)(value)
 
     def parse(self, path: str, text: str) -> Any:
         """The value that a cell of a CSV file holds; lengths are separated by spaces."""
@@ -139,36 +122,30 @@ def as_text(value: Any) -> str:
 
 # -------------------------------------------------------------------------------------------------------- the well
 
-# What one unit of the definition is in SI units, as a power of ten; fields not named here are in SI units.
-_BAR = ("reservoir_pressure", "manifold_pressure", "supply_pressure", "supply_droop", "supply_limit")
-PLANT_UNITS: dict[str, tuple[str, int]] = {
-    **dict.fromkeys((*_BAR, "trip_start", "trip_end", "root_width"), ("bar", 5)),
-    "productivity": ("kg/s/bar", -5),
-    "tubing_length": ("m", 0),
-    "tubing_diameter": ("m", 0),
-    "annulus_volume": ("m3", 0),
-    "perforation_depth": ("m", 0),
-    "liquid_density": ("kg/m3", 0),
-    "molar_mass": ("kg/mol", 0),
-    "tubing_temperature": ("K", 0),
-    "annulus_temperature": ("K", 0),
-    "near_well_time": ("s", 0),
-    "gas_oil_ratio": ("m3/m3", 0),
-    "choke_conductance": ("m2", 0),
-    "injection_conductance": ("m2", 0),
-    "slip_velocity": ("m/s", 0),
-    "slip_floor": ("m/s", 0),
-    "choke_time": ("s", 0),
-    "lift_time": ("s", 0),
-    "equalising_rate": ("1/s", 0),
+_PRESSURES = ("reservoir_pressure", "manifold_pressure", "supply_pressure", "supply_droop", "supply_limit")
+_IN_UNIT = {
+    "bar": (*_PRESSURES, "trip_start", "trip_end", "root_width"),
+    "kg/s/bar": ("productivity",),
+    "m": ("tubing_length", "tubing_diameter", "perforation_depth"),
+    "m2": ("choke_conductance", "injection_conductance"),
+    "m3": ("annulus_volume",),
+    "m3/m3": ("gas_oil_ratio",),
+    "m/s": ("slip_velocity", "slip_floor"),
+    "s": ("near_well_time", "choke_time", "lift_time"),
+    "1/s": ("equalising_rate",),
+    "K": ("tubing_temperature", "annulus_temperature"),
+    "kg/m3": ("liquid_density",),
+    "kg/mol": ("molar_mass",),
 }
+PLANT_UNITS = {name: unit for unit, names in _IN_UNIT.items() for name in names}  # of the others: 1
+SI_POWERS = {"bar": 5, "kg/s/bar": -5}  # of ten, of the units that are no SI units
 PLANT_FIELDS = tuple(field.name for field in dataclasses.fields(WellParameters))
 SHIPPED = {name: float(getattr(WellParameters(), name)) for name in PLANT_FIELDS}  # SI units
 
 
 def plant_si(name: str, value: float) -> float:
     """A well parameter in SI units; shifting the decimal point keeps 78.2901 bar equal to 7829010 Pa."""
-    power = PLANT_UNITS.get(name, ("1", 0))[1]
+    power = SI_POWERS.get(PLANT_UNITS.get(name, "1"), 0)
     return float(Decimal(repr(float(value))).scaleb(power)) if power else float(value)
 
 
@@ -220,7 +197,7 @@ def _table() -> dict[str, Field]:
     ]
     for name in PLANT_FIELDS:
         label = name.replace("_", " ")
-        out.append(Field(f"plant.{name}", f"{label} of the well", PLANT_UNITS.get(name, ("1", 0))[0]))
+        out.append(Field(f"plant.{name}", f"{label} of the well", PLANT_UNITS.get(name, "1")))
         out.append(Field(f"plant_scale.{name}", f"{label} of the well, relative", "1", low=0))
     for name, unit in zip(CV_NAMES, CV_UNITS, strict=True):
         out.append(Field(f"noise.{name}", f"noise of {_SPOKEN[name]}", unit, default=0.0, low=0))
@@ -241,14 +218,11 @@ def _table() -> dict[str, Field]:
 FIELDS = _table()
 
 
-def find(path: str, key: Any) -> Field:
-    """The field of a key, or an `InputError` at `path` that names similar keys."""
+def find(path: str, key: Any, *given: Any) -> Field:
+    """The field of a key, or an `InputError` at `path` that names similar keys and shows what is given, else the key."""
     if key not in FIELDS:
-        raise InputError(path, key, "a key of docs/studies.md", near(key, FIELDS) or similar_end(key))
+        # a last name that exists elsewhere, such as deadzone.gas_rate without tuning
+        alike = [known for known in FIELDS if known.endswith("." + str(key).rpartition(".")[2])][:3]
+        hint = near(key, FIELDS) or (f"Did you mean {' or '.join(alike)}?" if alike else "")
+        raise InputError(path, (*given, key)[0], "a key of docs/studies.md", hint)
     return FIELDS[key]
-
-
-def similar_end(key: Any) -> str:
-    """A hint for keys whose last name exists elsewhere, such as ``deadzone.gas_rate`` without ``tuning``."""
-    found = [known for known in FIELDS if known.endswith("." + str(key).rpartition(".")[2])][:3]
-    return f"Did you mean {' or '.join(found)}?" if found else ""

@@ -10,6 +10,7 @@ from identify.step_test import identify_step_response
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.plant import check_inputs, steady_state
+from studies.definition.refusing import require
 
 Point = tuple[float, float]
 STEPS = (2.0, 100.0)  # of the choke [%] and of the gas lift [m3/h]
@@ -21,15 +22,11 @@ _steady_state = jax.jit(steady_state)
 def identify_models(
     points: Iterable[Point], samples: int = SAMPLES, *, progress: Callable[[int, int], None] | None = None
 ) -> dict[Point, StepResponseModel]:
-    """Step-response models of the shipped well at some working points.
+    """Models of the shipped well by working point ``(choke [%], gas lift [m3/h])``, in the order of first appearance.
 
     Args:
-        points: ``(choke [%], gas lift [m3/h])``; repeats are identified once.
         samples: number of coefficients N.
         progress: called with ``(done, total)`` models.
-
-    Returns:
-        Models by working point, in the order of first appearance.
 
     Raises:
         InputError: naming the working point, for one outside its range (the step test goes 2 % and 100 m3/h further) or
@@ -42,11 +39,10 @@ def identify_models(
             check_inputs(choke, lift)
             check_inputs(choke + STEPS[0], lift + STEPS[1])
         except InputError as error:
-            raise InputError(
-                here, error.value, f"{error.expected}, also {STEPS[0]:g} % and {STEPS[1]:g} m3/h further"
-            ) from None
-        if not bool(_steady_state(choke, lift).converged):
-            raise InputError(here, "no steady state", "a working point at which the well settles")
+            expected = f"{error.expected}, also {STEPS[0]:g} % and {STEPS[1]:g} m3/h further"
+            raise InputError(here, error.value, expected) from None
+        settles = _steady_state(choke, lift).converged
+        require(settles, here, "no steady state", "a working point at which the well settles")
     out = {}
     for choke, lift in wanted:
         out[choke, lift] = identify_step_response(None, choke, lift, STEPS, samples)

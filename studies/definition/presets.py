@@ -11,10 +11,10 @@ from __future__ import annotations
 import copy
 from typing import Any, Literal
 
-from jaxmpc.errors import InputError
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning, make_tuning
 from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS
+from studies.definition.refusing import require
 
 CHOKE, LIFT = MV_NAMES
 GAS, OIL = CV_NAMES
@@ -46,25 +46,19 @@ _THESIS: Fields = {
 }
 
 
-def _changed(**fields: Any) -> Fields:
-    return {**copy.deepcopy(_THESIS), **fields}
-
+_PLAIN: Fields = _THESIS | {name: {GAS: 0.0, OIL: 0.0} for name in ("soft_quadratic", "soft_linear")}
 
 TUNINGS: dict[str, Fields] = {
     # Table 1, choke moves charged 250 per (%)^2 for every controller.
     "thesis": _THESIS,
     # Table 1 with its 1000 taken per (%)^2, as the thesis's continuous controllers did.
-    "thesis-literal": _changed(move_weight={CHOKE: 1000.0, LIFT: 0.2}),
+    "thesis-literal": _THESIS | {"move_weight": {CHOKE: 1000.0, LIFT: 0.2}},
     # A quarter of the weight (1000 / 16): shows what the well does when the choke moves too readily.
-    "thesis-light": _changed(move_weight={CHOKE: 62.5, LIFT: 0.2}),
+    "thesis-light": _THESIS | {"move_weight": {CHOKE: 62.5, LIFT: 0.2}},
     # Without Soft MPC, as hard everywhere as the soft controller is far outside its deadzone (figure 13).
-    "no-soft": _changed(
-        soft_quadratic={GAS: 0.0, OIL: 0.0},
-        soft_linear={GAS: 0.0, OIL: 0.0},
-        cv_weight={GAS: 2e-4, OIL: 0.2},
-    ),
+    "no-soft": _PLAIN | {"cv_weight": {GAS: 2e-4, OIL: 0.2}},
     # Without Soft MPC, the extra penalty simply left out.
-    "no-soft-plain": _changed(soft_quadratic={GAS: 0.0, OIL: 0.0}, soft_linear={GAS: 0.0, OIL: 0.0}),
+    "no-soft-plain": _PLAIN,
 }
 
 
@@ -75,8 +69,8 @@ def structure(blocking: Literal["moves", "inputs", "none"] = "moves", *, integer
         blocking: meaning of a block, or ``none`` for 200 single moves.
         integer: whether the choke moves in steps of 2 %.
     """
-    if blocking not in ("moves", "inputs", "none"):
-        raise InputError("structure.blocking", blocking, "'moves', 'inputs' or 'none'")
+    known = blocking in ("moves", "inputs", "none")
+    require(known, "structure.blocking", blocking, "'moves', 'inputs' or 'none'")
     shape: dict[str, Any] = {"blocks": ()} if blocking == "none" else {"blocking": blocking}
     return Structure(
         cv_names=CV_NAMES,
@@ -95,8 +89,7 @@ def tuning_fields(preset: str = "thesis", changes: Fields | None = None) -> Fiel
     Raises:
         InputError: for an unknown preset.
     """
-    if preset not in TUNINGS:
-        raise InputError("tuning", preset, f"one of the presets {', '.join(TUNINGS)}")
+    require(preset in TUNINGS, "tuning", preset, f"one of the presets {', '.join(TUNINGS)}")
     return {**copy.deepcopy(TUNINGS[preset]), **(changes or {})}
 
 

@@ -6,6 +6,7 @@ that knows nothing of the step choke then hunts between the two.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 
 from jaxmpc.loop.reference import Reference
@@ -33,11 +34,12 @@ THESIS_DURATION = 78_000.0
 QUICK_WINDOWS = ((0, 9640, 152), (3600, 5870, 100.6), (8400, 16500, 230))
 QUICK_DURATION = 12_000.0
 
-# Operating regions: three targets of the thesis run with the choke in one part of its range, of equal length.
-WIDE_OPEN_WINDOWS = ((0, 8430, 173), (6000, 14000, 205), (12000, 16500, 230))  # 70 % and more
-MID_CHOKE_WINDOWS = ((0, 12600, 175), (6000, 8160, 166), (12000, 10260, 167))  # 30 to 51 %
-NEARLY_CLOSED_WINDOWS = ((0, 6995, 133), (6000, 5870, 100.6), (12000, 5445, 88))  # 19 % down to 7 %
 REGION_DURATION = 18_000.0
+REGIONS = {  # three targets of the thesis run with the choke in one part of its range, of equal length
+    "wide-open": ((0, 8430, 173), (6000, 14000, 205), (12000, 16500, 230)),  # 70 % and more
+    "mid-choke": ((0, 12600, 175), (6000, 8160, 166), (12000, 10260, 167)),  # 30 to 51 %
+    "nearly-closed": ((0, 6995, 133), (6000, 5870, 100.6), (12000, 5445, 88)),  # 19 % down to 7 %
+}
 
 
 def from_windows(windows: Sequence[Sequence[float]], duration: float) -> Reference:
@@ -55,26 +57,9 @@ def quick() -> Reference:
     return from_windows(QUICK_WINDOWS, QUICK_DURATION)
 
 
-def wide_open() -> Reference:
-    """Three targets with the choke at 70 % and more, 1,800 samples of 10 s; CV order gas, oil [m3/h]."""
-    return from_windows(WIDE_OPEN_WINDOWS, REGION_DURATION)
-
-
-def mid_choke() -> Reference:
-    """Three targets with the choke at 30 to 51 %, 1,800 samples of 10 s; CV order gas, oil [m3/h]."""
-    return from_windows(MID_CHOKE_WINDOWS, REGION_DURATION)
-
-
-def nearly_closed() -> Reference:
-    """Three targets with the choke at 19 % down to 7 %, 1,800 samples of 10 s; CV order gas, oil [m3/h]."""
-    return from_windows(NEARLY_CLOSED_WINDOWS, REGION_DURATION)
-
-
 # What a study definition calls them.
 NAMED: dict[str, Callable[[], Reference]] = {
     "thesis": thesis,
     "quick": quick,
-    "wide-open": wide_open,
-    "mid-choke": mid_choke,
-    "nearly-closed": nearly_closed,
+    **{name: functools.partial(from_windows, rows, REGION_DURATION) for name, rows in REGIONS.items()},
 }

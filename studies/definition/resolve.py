@@ -25,6 +25,7 @@ from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES, WellParameters, ch
 from studies.definition import presets, references
 from studies.definition.axes import AxisTable
 from studies.definition.fields import FIELDS, PLANT_FIELDS, SHIPPED, plant_si
+from studies.definition.refusing import located, require
 from studies.definition.sections import ReferenceDefinition
 from studies.definition.sweep import StudyDefinition
 
@@ -36,52 +37,33 @@ LONGEST_RUN = 1_000_000  # samples
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Variant:
-    """What fixes shapes and setpoints, shared by all scenarios that agree in it.
+    """What fixes shapes and setpoints, shared by all scenarios that agree in it."""
 
-    Attributes:
-        kind: ``continuous`` or ``mixed-integer``.
-        actuator: ``continuous`` or ``step``.
-        structure: of the controller.
-        reference: setpoints, cut to the length of the run.
-        samples: length of the run [samples].
-    """
-
-    kind: str
-    actuator: str
-    structure: Structure
-    reference: Reference
-    samples: int
+    kind: str  # continuous or mixed-integer
+    actuator: str  # continuous or step
+    structure: Structure  # of the controller
+    reference: Reference  # setpoints, cut to the length of the run
+    samples: int  # length of the run [samples]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Inputs:
-    """All scenarios in the units of `jaxmpc`; an array that does not vary has one row for all.
+    """All scenarios in the units of `jaxmpc`; an array that does not vary has one row for all."""
 
-    Attributes:
-        variants: distinct shapes.
-        variant: ``"scenario"``, which of them.
-        tuning: per field of `jaxmpc.problem.tuning.Tuning` ``"scenario name"``, and ``"scenario"`` for the bias cut-off.
-        plant: per field of `jaxmpc.process.well.equations.WellParameters` ``"scenario"``, SI units.
-        point: ``"scenario 2"``, working point of the model: choke [%], gas lift [m3/h].
-        noise: ``"scenario cv"``, standard deviation [CV unit].
-        seed: ``"scenario"``, of the noise.
-        pressure: ``"scenario step 2"``, steps of the reservoir pressure: time [s], offset from then on [bar].
-        fault_kinds: CV and kind of every sensor fault.
-        faults: ``"scenario fault 3"``, time [s], duration [s] and size [CV unit] of the sensor faults.
-        told: ``"scenario"``, whether the controller is told where the actuators stand.
-    """
-
-    variants: tuple[Variant, ...]
-    variant: np.ndarray
+    variants: tuple[Variant, ...]  # distinct shapes
+    variant: np.ndarray  # "scenario", which of them
+    # per field of `jaxmpc.problem.tuning.Tuning` "scenario name", and "scenario" for the bias cut-off
     tuning: dict[str, np.ndarray]
+    # per field of `jaxmpc.process.well.equations.WellParameters` "scenario", SI units
     plant: dict[str, np.ndarray]
-    point: np.ndarray
-    noise: np.ndarray
-    seed: np.ndarray
+    point: np.ndarray  # "scenario 2", working point of the model: choke [%], gas lift [m3/h]
+    noise: np.ndarray  # "scenario cv", standard deviation [CV unit]
+    seed: np.ndarray  # "scenario", of the noise
+    # "scenario step 2", steps of the reservoir pressure: time [s], offset from then on [bar]
     pressure: np.ndarray
-    fault_kinds: tuple[tuple[str, str], ...]
-    faults: np.ndarray
-    told: np.ndarray
+    fault_kinds: tuple[tuple[str, str], ...]  # CV and kind of every sensor fault
+    faults: np.ndarray  # "scenario fault 3", time [s], duration [s] and size [CV unit] of the sensor faults
+    told: np.ndarray  # "scenario", whether the controller is told where the actuators stand
 
 
 def row(array: np.ndarray, k: int) -> np.ndarray:
@@ -142,6 +124,7 @@ def resolve(definition: StudyDefinition, table: AxisTable) -> Inputs:
     settings = Settings(definition, table)
     variants, variant = _variants(settings)
     kinds = np.array([v.kind == "mixed-integer" for v in variants])
+    runs = np.array([v.reference.duration for v in variants])[variant], variants[0].structure.dt
     inputs = Inputs(
         variants=variants,
         variant=variant,
@@ -150,9 +133,9 @@ def resolve(definition: StudyDefinition, table: AxisTable) -> Inputs:
         point=settings.columns(("model.choke", "model.lift")),
         noise=settings.columns([f"noise.{name}" for name in CV_NAMES]),
         seed=settings.numbers("seed").astype(np.int64),
-        pressure=_events(settings, variants, variant, "disturbance", ("time", "offset")),
+        pressure=_events(settings, "disturbance", ("time", "offset"), *runs),
         fault_kinds=tuple((fault.cv, fault.kind) for fault in settings.base.get("sensor_fault", ())),
-        faults=_sensor_faults(settings, variants, variant),
+        faults=_events(settings, "sensor_fault", ("time", "duration", "size"), *runs),
         told=settings.numbers("position_feedback").astype(bool),
     )
     check_inputs(inputs.point[:, 0], inputs.point[:, 1])
@@ -176,13 +159,9 @@ def _variants(settings: Settings) -> tuple[tuple[Variant, ...], np.ndarray]:
             cut[wanted] = _reference(settings, k, *wanted)
         reference = cut[wanted]
         samples = reference.samples(structure.dt)
-        if samples < 1:
-            raise InputError(
-                settings.table.blame(["duration"], k), wanted[1], f"one sample of {structure.dt:g} s or more"
-            )
-        if samples > LONGEST_RUN:
-            path = settings.table.blame(["duration" if wanted[1] is not None else "reference"], k)
-            raise InputError(path, f"{samples} samples", f"a run of at most {LONGEST_RUN} samples")
+        path = settings.table.blame(["reference" if wanted[1] is None else "duration"], k)
+        require(samples >= 1, path, wanted[1], f"one sample of {structure.dt:g} s or more")
+        require(samples <= LONGEST_RUN, path, f"{samples} samples", f"a run of at most {LONGEST_RUN} samples")
         variants.append(Variant(value("controller"), value("actuator"), structure, reference, samples))
     return tuple(variants), index
 
@@ -194,7 +173,13 @@ def _structure(settings: Settings, k: int) -> Structure:
     horizon = value("control_horizon") or sum(blocks)
     base = presets.structure("moves", integer=value("controller") == "mixed-integer")
     same = ("prediction_horizon", "first_penalised", "mean_move_window", "mean_move_mode")
-    try:
+
+    def place(field: str) -> str:
+        key = field.removeprefix("structure.")
+        partner = {"blocks": ["control_horizon"], "first_penalised": ["prediction_horizon"]}.get(key, [])
+        return settings.table.blame([key, *filter(settings.given, partner)], k)
+
+    with located(place):
         return dataclasses.replace(
             base,
             control_horizon=horizon,
@@ -202,11 +187,6 @@ def _structure(settings: Settings, k: int) -> Structure:
             blocking="moves" if blocking == "none" else blocking,
             **{key: value(key) for key in same},
         )
-    except InputError as error:
-        key = error.field.removeprefix("structure.")
-        partner = {"blocks": ["control_horizon"], "first_penalised": ["prediction_horizon"]}.get(key, [])
-        keys = [key, *(other for other in partner if settings.given(other))]
-        raise InputError(settings.table.blame(keys, k), error.value, error.expected, error.hint) from None
 
 
 def _reference(settings: Settings, k: int, name: Any, duration: float | None) -> Reference:
@@ -214,9 +194,8 @@ def _reference(settings: Settings, k: int, name: Any, duration: float | None) ->
     whole = name.build("base.") if isinstance(name, ReferenceDefinition) else references.NAMED[name]()
     if duration is None or duration == whole.duration:
         return whole
-    if not 0 < duration <= whole.duration:
-        path = settings.table.blame(["duration"], k)
-        raise InputError(path, duration, f"more than 0 s and at most the reference's {whole.duration:g} s")
+    expected = f"more than 0 s and at most the reference's {whole.duration:g} s"
+    require(0 < duration <= whole.duration, settings.table.blame(["duration"], k), duration, expected)
     kept = whole.times < duration
     return Reference(whole.times[kept], whole.setpoints[kept], float(duration))
 
@@ -244,26 +223,17 @@ def _tuning(settings: Settings, integer: np.ndarray) -> dict[str, np.ndarray]:
             name = NAMES[low][i]
             keys = [f"tuning.{field}.{name}" for field in (low, high)]
             keys = [key for key in keys if settings.given(key)] or keys
-            raise InputError(
-                settings.table.blame(keys, k),
-                f"{low} {smaller[k, i]:g}, {high} {larger[k, i]:g}",
-                f"{low} of {name} at most its {high} [{FIELDS[f'tuning.{low}.{name}'].unit}]",
-            )
+            found = f"{low} {smaller[k, i]:g}, {high} {larger[k, i]:g}"
+            expected = f"{low} of {name} at most its {high} [{FIELDS[f'tuning.{low}.{name}'].unit}]"
+            raise InputError(settings.table.blame(keys, k), found, expected)
     rows = settings.numbers("tuning.oscillation_rows").astype(bool)
     rows, whole = np.broadcast_arrays(rows, integer)
     out["oscillation_rows"] = np.stack([rows & whole, np.zeros_like(whole)], axis=1)
-    return _without_soft(settings, out)
-
-
-def _without_soft(settings: Settings, out: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Soft MPC off: as hard everywhere as the soft controller is far outside its deadzone, as preset ``no-soft``."""
-    soft = settings.numbers("soft").astype(bool)
-    if soft.all():
-        return out
-    soft = soft[:, None]
-    out["cv_weight"] = out["cv_weight"] + np.where(soft, 0.0, out["soft_quadratic"])
-    for field in ("soft_quadratic", "soft_linear"):
-        out[field] = np.where(soft, out[field], 0.0)
+    soft = settings.numbers("soft").astype(bool)[:, None]
+    if not soft.all():  # as hard everywhere as the soft controller is far outside its deadzone, as in no-soft
+        out["cv_weight"] = out["cv_weight"] + np.where(soft, 0.0, out["soft_quadratic"])
+        for field in ("soft_quadratic", "soft_linear"):
+            out[field] = np.where(soft, out[field], 0.0)
     return out
 
 
@@ -283,10 +253,8 @@ def _plant(settings: Settings) -> dict[str, np.ndarray]:
     for name in PLANT_FIELDS:
         absolute, relative = f"plant.{name}", f"plant_scale.{name}"
         if settings.given(absolute) and settings.given(relative):
-            path = settings.table.blame([relative], 0)
-            raise InputError(
-                path, settings.value(relative, 0), f"nothing: {absolute} is set as well; choose one"
-            )
+            expected = f"nothing: {absolute} is set as well; choose one"
+            raise InputError(settings.table.blame([relative], 0), settings.value(relative, 0), expected)
         if settings.given(absolute):
             out[name] = settings.numbers(absolute, lambda value, name=name: plant_si(name, value))
         elif settings.given(relative):
@@ -308,43 +276,28 @@ def _located(settings: Settings, plant: dict[str, np.ndarray], error: InputError
         except InputError as found:
             name = found.field.removeprefix("well.")
             names = [name, *["trip_end"] * found.expected.endswith("trip_end")]  # what it is compared with
-            keys = [
-                key for n in names for key in (f"plant.{n}", f"plant_scale.{n}") if settings.given(key)
-            ] or [f"plant.{name}"]
-            value = settings.value(keys[0], k)
+            keys = [f"{table}.{n}" for n in names for table in ("plant", "plant_scale")]
+            keys = list(filter(settings.given, keys)) or [f"plant.{name}"]
             expected = found.expected.replace(" (SI units)", "").replace(" [Pa]", "")
-            path = settings.table.blame(keys, k)
-            return InputError(path, value, f"{expected} [{FIELDS[keys[0]].unit}] for {keys[0]}")
+            expected = f"{expected} [{FIELDS[keys[0]].unit}] for {keys[0]}"
+            return InputError(settings.table.blame(keys, k), settings.value(keys[0], k), expected)
     return error
 
 
-def _sensor_faults(settings: Settings, variants: tuple[Variant, ...], variant: np.ndarray) -> np.ndarray:
-    """Sensor faults "scenario fault 3"; every one begins within every run."""
-    out = _events(settings, variants, variant, "sensor_fault", ("time", "duration", "size"))
-    lengths, expected = out[:, :, 1], "a duration above 0 s"
-    _refuse(settings, "sensor_fault.duration", lengths, lengths <= 0, lambda _: expected)
-    return out
-
-
 def _events(
-    settings: Settings,
-    variants: tuple[Variant, ...],
-    variant: np.ndarray,
-    table: str,
-    names: tuple[str, ...],
+    settings: Settings, table: str, names: tuple[str, ...], durations: np.ndarray, dt: float
 ) -> np.ndarray:
-    """What ``[[base.TABLE]]`` lists, "scenario event name"; the first name is the time, which lies within every run.
+    """What ``[[base.TABLE]]`` lists, "scenario event name".
 
-    What is not given is one sample long.
+    The time lies within every run, of `durations` "scenario" [s]; a duration is positive, `dt` [s] where it is not given.
     """
     events = settings.base.get(table, ())
     keys = [f"{table}.{name}" for name in names]
     varied = [key for key in keys if settings.table.column(key) is not None]
-    if varied and len(events) != 1:
-        path = settings.table.blame(varied[:1], 0)
-        expected = f"exactly one [[base.{table}]], whose {' or '.join(names)} the axis replaces"
-        raise InputError(path, f"{len(events)} of them", expected)
-    given = lambda event, name: variants[0].structure.dt if (v := getattr(event, name)) is UNSET else v  # noqa: E731
+    path, found = settings.table.blame(varied[:1], 0), f"{len(events)} of them"
+    expected = f"exactly one [[base.{table}]], whose {' or '.join(names)} the axis replaces"
+    require(not varied or len(events) == 1, path, found, expected)
+    given = lambda event, name: dt if (v := getattr(event, name)) is UNSET else v  # noqa: E731
     columns = [
         settings.numbers(key) if key in varied else np.array([given(event, name)])
         for event in events
@@ -353,19 +306,13 @@ def _events(
     if not columns:
         return np.zeros((1, 0, len(names)))
     out = np.stack(np.broadcast_arrays(*columns), axis=1).reshape(-1, len(events), len(names))
-    durations = np.array([v.reference.duration for v in variants])[variant]
-    late = out[:, :, 0] >= durations[:, None]
-    expected = lambda k: f"a time within the run of {durations[k]:g} s"  # noqa: E731
-    _refuse(settings, keys[0], out[:, :, 0], late, expected)
+    wrong = {"time": out[:, :, 0] >= durations[:, None]}
+    if "duration" in names:
+        wrong["duration"] = out[:, :, 1] <= 0
+    for name, bad in wrong.items():
+        for k, i in np.argwhere(bad)[:1].tolist():
+            within = f"a time within the run of {durations[k]:g} s"
+            expected = within if name == "time" else "a duration above 0 s"
+            path = settings.table.blame([f"{table}.{name}"], k) if varied else f"base.{table}[{i}].{name}"
+            raise InputError(path, float(row(out, k)[i, names.index(name)]), expected)
     return out
-
-
-def _refuse(
-    settings: Settings, key: str, values: np.ndarray, wrong: np.ndarray, expected: Callable[[int], str]
-) -> None:
-    """An `InputError` for the first wrong number "scenario event" of a key of listed events, by its path."""
-    table, _, name = key.partition(".")
-    for k, i in np.argwhere(wrong)[:1].tolist():
-        axis = any(settings.table.column(f) is not None for f in FIELDS if f.startswith(f"{table}."))
-        path = settings.table.blame([key], k) if axis else f"base.{table}[{i}].{name}"
-        raise InputError(path, float(row(values, k)[i]), expected(k))

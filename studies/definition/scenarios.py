@@ -16,9 +16,9 @@ from msgspec import UnsetType
 
 from jaxmpc import html
 from jaxmpc.controller.measurement import SensorFault, fault_errors
-from jaxmpc.errors import InputError
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.trajectory import AXES
+from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning, make_tuning
 from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES, WellParameters
@@ -26,6 +26,7 @@ from studies.definition import models
 from studies.definition.axes import AxisTable, expand_axes
 from studies.definition.comparison import held_offsets
 from studies.definition.estimate import MODEL_SECONDS, Description, Work, chunk_seconds
+from studies.definition.refusing import require
 from studies.definition.resolve import Inputs, Variant, resolve, row
 from studies.definition.sweep import StudyDefinition
 from studies.store import fingerprint
@@ -34,12 +35,7 @@ from studies.store.layout import Column
 KEY_FIGURES = 64  # numbers of a scenario besides trajectories
 NUMBER_BYTES = 8
 CHUNKS = 8  # at least, of a study with that many scenarios
-COMPUTING = (
-    "kpi.loop",
-    "kpi.setpoint",
-    "kpi.sweep",
-    "run.chunk",
-)  # modules of `studies` that results depend on
+COMPUTING = ("kpi.loop", "kpi.setpoint", "kpi.sweep", "run.chunk")  # what results depend on of `studies`
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -47,15 +43,12 @@ class Scenario:
     """The inputs of one run, typed and checked.
 
     Attributes:
-        number: of the scenario.
-        kind: of the controller.
+        kind, tuning: of the controller.
         actuator: of the choke.
         structure: of the controller; the same object for all scenarios of a group that agree in it.
-        tuning: of the controller.
         model_point: working point ``(choke [%], gas lift [m3/h])`` at which the model is identified, on the nominal well.
         plant: parameters of the well that is controlled.
         reference: setpoints; the same object for scenarios with the same ones.
-        samples: length of the run.
         noise: standard deviation ``"cv"`` [CV unit]; None without noise.
         seed: of the noise.
         disturbance: offset of the reservoir pressure ``"sample"`` [bar]; None without any.
@@ -81,12 +74,13 @@ class Scenario:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Group:
-    """Scenarios that one compiled program computes.
+    """Scenarios that one compiled program computes with one matrix of responses where their model is the same.
+
+    Groups of one size share the program; a batch of several structures would lose what makes its Newton steps fast.
 
     Attributes:
         kind, actuator, structure, samples: what all of them have.
         has_limits: whether they have a finite CV limit.
-        whole_steps: most steps of a whole choke move; 0 for continuous moves.
         switching: whether bad measurements may switch a CV off.
         points: distinct working points of their models.
         scenarios: their numbers, increasing.
@@ -97,25 +91,24 @@ class Group:
     structure: Structure
     samples: int
     has_limits: bool
-    whole_steps: int
     switching: bool
     points: tuple[tuple[float, float], ...]
     scenarios: np.ndarray
 
+    @property
+    def program(self) -> tuple[Any, ...]:
+        """What it is compiled for, besides the number of lanes."""
+        size, whole = Size.of(self.structure, models.SAMPLES), bool(self.structure.integer_mvs)
+        return size, whole, self.actuator, self.has_limits, self.switching, len(self.points) == 1
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Chunk:
-    """What is computed and stored together.
-
-    Attributes:
-        index: of the chunk.
-        group: index of its group.
-        scenarios: 1 to ``chunk_size`` scenario numbers, increasing; lanes beyond are padding.
-    """
+    """What is computed and stored together."""
 
     index: int
-    group: int
-    scenarios: np.ndarray
+    group: int  # index of its group
+    scenarios: np.ndarray  # 1 to ``chunk_size`` scenario numbers, increasing; lanes beyond are padding
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -124,7 +117,6 @@ class Study:
 
     Attributes:
         definition: as written, quick cuts applied.
-        count: number of scenarios.
         columns: one coordinate per axis key, in the order of the axes.
         groups: in the order of their first scenarios.
         chunks: of the groups in turn, each of consecutive scenarios of one group.
@@ -179,9 +171,8 @@ class Study:
 
     def scenario_hash(self, k: int) -> str:
         """Content hash of the numbers of scenario k and of the code that turns them into a run."""
-        inputs = self._inputs
         self._variant(k)  # refuses numbers that are no scenario
-        noise = row(inputs.noise, k)
+        inputs, noise = self._inputs, row(self._inputs.noise, k)
         return fingerprint.content_hash(
             self._code,
             self._variant_hashes[inputs.variant[k]],
@@ -212,11 +203,9 @@ class Study:
     def hash(self) -> str:
         """Of everything that the stored results depend on: all scenarios, their coordinates, and what is stored."""
         columns = [(c.key, c.label, c.unit, c.values.tolist()) for c in self.columns]
-        store = self.definition.store
         chunks = [(c.group, c.scenarios.tolist()) for c in self.chunks]
-        return fingerprint.content_hash(
-            list(self.scenario_hashes), columns, chunks, store.every, list(store.trajectories)
-        )
+        kept = self.definition.store.every, list(self.definition.store.trajectories)
+        return fingerprint.content_hash(list(self.scenario_hashes), columns, chunks, *kept)
 
     def lanes(self, group: int) -> int:
         """Scenarios of the compiled program of a group, padding included."""
@@ -235,16 +224,14 @@ class Study:
         """What a run would do, for a dry run; prints as a short table."""
         store = self.definition.store
         widths = {"": 1, "cv": len(CV_NAMES), "mv": len(MV_NAMES)}
-        kept = sum(
-            widths[axis] for axis, names in AXES.items() for name in names if name in store.trajectories
-        )
+        kept = sum(widths[axis] * len(set(names) & set(store.trajectories)) for axis, names in AXES.items())
         points = math.ceil(max(group.samples for group in self.groups) / store.every)
         return Description(
             name=self.name,
             scenarios=self.count,
             group_sizes=tuple(len(group.scenarios) for group in self.groups),
             chunks=len(self.chunks),
-            compilations=len(self.groups),
+            compilations=len({(*group.program, self.lanes(i)) for i, group in enumerate(self.groups)}),
             models=len(self.model_points),
             samples=sum(len(group.scenarios) * group.samples for group in self.groups),
             stored_bytes=self.count * (KEY_FIGURES + kept * points) * NUMBER_BYTES,
@@ -256,8 +243,8 @@ class Study:
         return html.study(self)
 
     def _variant(self, k: int) -> Variant:
-        if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not 0 <= k < self.count:
-            raise InputError("scenario", k, f"a number from 0 to {self.count - 1}")
+        whole = isinstance(k, (int, np.integer)) and not isinstance(k, bool)
+        require(whole and 0 <= k < self.count, "scenario", k, f"a number from 0 to {self.count - 1}")
         return self._inputs.variants[self._inputs.variant[k]]
 
     def _disturbance(self, k: int) -> np.ndarray | None:
@@ -282,17 +269,12 @@ class Study:
 
     @functools.cached_property
     def _variant_hashes(self) -> list[str]:
-        return [
-            fingerprint.content_hash(
-                v.kind,
-                v.actuator,
-                dataclasses.asdict(v.structure),
-                np.asarray(v.reference.times),
-                np.asarray(v.reference.setpoints),
-                v.samples,
-            )
-            for v in self._inputs.variants
-        ]
+        out = []
+        for v in self._inputs.variants:
+            reference = np.asarray(v.reference.times), np.asarray(v.reference.setpoints)
+            shape = v.kind, v.actuator, dataclasses.asdict(v.structure)
+            out.append(fingerprint.content_hash(*shape, *reference, v.samples))
+        return out
 
 
 def code_hash() -> str:
@@ -335,34 +317,22 @@ def default_chunk_size(scenarios: int) -> int:
 
 
 def _columns(table: AxisTable) -> tuple[Column, ...]:
-    out = []
-    for a, axis in enumerate(table.axes):
-        for field, label, values in zip(axis.fields, axis.labels, axis.values, strict=True):
-            out.append(Column(field.key, label, field.unit, field.column(values)[table.index[:, a]]))
-    return tuple(out)
+    return tuple(
+        Column(field.key, label, field.unit, field.column(values)[table.index[:, a]])
+        for a, axis in enumerate(table.axes)
+        for field, label, values in zip(axis.fields, axis.labels, axis.values, strict=True)
+    )
 
 
 def _groups(inputs: Inputs, count: int) -> tuple[Group, ...]:
     tuning = inputs.tuning
     limited = np.any(np.isfinite(tuning["cv_low"]) | np.isfinite(tuning["cv_high"]), axis=1)
-    reach = np.maximum(-tuning["move_low"][:, 0], tuning["move_high"][:, 0])  # of the choke [%]
     switching = np.any(np.isfinite(tuning["bad_limit"]), axis=1)
-    members: dict[tuple[Any, Any, Any, int, bool, int, bool], list[int]] = {}
+    members: dict[tuple[Any, Any, Any, int, bool, bool], list[int]] = {}
     for k in range(count):
         variant = inputs.variants[inputs.variant[k]]
-        step = variant.structure.integer_step[0]
-        farthest = float(min(row(reach, k), row(tuning["mv_high"], k)[0] - row(tuning["mv_low"], k)[0], 1e6))
-        steps = int(farthest / step + 1e-9) if step else 0
-        key = (
-            variant.kind,
-            variant.actuator,
-            variant.structure,
-            variant.samples,
-            bool(row(limited, k)),
-            steps,
-            bool(row(switching, k)),
-        )
-        members.setdefault(key, []).append(k)
+        same = variant.kind, variant.actuator, variant.structure, variant.samples
+        members.setdefault((*same, bool(row(limited, k)), bool(row(switching, k))), []).append(k)
     groups = []
     for key, scenarios in members.items():
         points = dict.fromkeys(tuple(row(inputs.point, k).tolist()) for k in scenarios)

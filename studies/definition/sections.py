@@ -8,10 +8,10 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from jaxmpc.controller.measurement import FAULTS
-from jaxmpc.errors import InputError
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.trajectory import AXES
 from jaxmpc.process.well.equations import CV_NAMES
+from studies.definition.refusing import located, require
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 STORABLE = tuple(name for names in AXES.values() for name in names if name != "time")
@@ -22,20 +22,14 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename=la
 
 
 class StudySection(Section, frozen=True):
-    """``[study]``.
+    """``[study]``."""
 
-    Attributes:
-        name: of the study and of its folder of results.
-        title: for reports.
-        chunk_size: scenarios that are computed and stored together; if not given, `scenarios.default_chunk_size` of a
-            study, `search_study.BATCH` of a search.
-        confirmation_limit: scenarios beyond which a run must be confirmed.
-    """
-
-    name: str
-    title: str = ""
+    name: str  # of the study and of its folder of results
+    title: str = ""  # for reports
+    # scenarios that are computed and stored together; if not given, `scenarios.default_chunk_size` of a
+    # study, `search_study.BATCH` of a search
     chunk_size: Count | UnsetType = UNSET
-    confirmation_limit: Count = 10_000
+    confirmation_limit: Count = 10_000  # scenarios beyond which a run must be confirmed
 
 
 class Range(Section, frozen=True):
@@ -89,32 +83,22 @@ class Sampling(Section, frozen=True):
 
 
 class Search(Section, frozen=True):
-    """``[search]``: the axes are searched, batch by batch, instead of listed.
+    """``[search]``: the axes are searched, batch by batch, instead of listed."""
 
-    Attributes:
-        objectives: key figures of `studies.kpi.objectives`, one or more.
-        batches: how many chunks are asked for, each after the results of the one before.
-        directions: one per objective; all are minimized if not given.
-        sampler: what asks.
-        seed: of the sampler.
-    """
-
+    # key figures of `studies.kpi.objectives`, one or more
     objectives: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
-    batches: Count
+    batches: Count  # how many chunks are asked for, each after the results of the one before
+    # one per objective; all are minimized if not given
     directions: tuple[Literal["minimize", "maximize"], ...] | UnsetType = UNSET
-    sampler: Literal["nsga2", "tpe"] = "nsga2"
-    seed: Annotated[int, msgspec.Meta(ge=0)] = 0
+    sampler: Literal["nsga2", "tpe"] = "nsga2"  # what asks
+    seed: Annotated[int, msgspec.Meta(ge=0)] = 0  # of the sampler
 
 
 class Store(Section, frozen=True):
-    """``[store]``.
+    """``[store]``."""
 
-    Attributes:
-        every: samples from one stored point of a trajectory to the next.
-        trajectories: which fields of `jaxmpc.loop.trajectory.Trajectory` to keep over time.
-    """
-
-    every: Count = 10
+    every: Count = 10  # samples from one stored point of a trajectory to the next
+    # which fields of `jaxmpc.loop.trajectory.Trajectory` to keep over time
     trajectories: tuple[Literal[STORABLE], ...] = ("cv", "mv", "setpoint")  # type: ignore[valid-type]
 
 
@@ -166,17 +150,11 @@ class FaultSection(Section, frozen=True):
 
 
 class ReferenceDefinition(Section, frozen=True):
-    """``[base.reference]`` and the setpoints of a comparison; see `jaxmpc.loop.reference.Reference`.
+    """``[base.reference]`` and the setpoints of a comparison; see `jaxmpc.loop.reference.Reference`."""
 
-    Attributes:
-        times: change times [s].
-        setpoints: one row per change, in CV order [CV unit].
-        duration: length of the run [s].
-    """
-
-    times: tuple[float, ...]
-    setpoints: tuple[tuple[float, ...], ...]
-    duration: float
+    times: tuple[float, ...]  # change times [s]
+    setpoints: tuple[tuple[float, ...], ...]  # one row per change, in CV order [CV unit]
+    duration: float  # length of the run [s]
 
     @classmethod
     def of(cls, reference: Reference) -> ReferenceDefinition:
@@ -185,19 +163,9 @@ class ReferenceDefinition(Section, frozen=True):
         return cls(tuple(reference.times.tolist()), setpoints, reference.duration)
 
     def build(self, place: str = "") -> Reference:
-        """The checked reference.
-
-        Args:
-            place: of ``reference`` in the definition, for errors, such as ``base.``.
-
-        Raises:
-            InputError: with the path in the definition.
-        """
-        try:
+        """The checked reference; `place` is the path of the table that it stands in, for errors, such as ``base.``."""
+        with located(lambda field: f"{place}{field}"):
             reference = Reference(self.times, self.setpoints, self.duration)
-        except InputError as error:
-            raise InputError(f"{place}{error.field}", error.value, error.expected, error.hint) from None
-        if reference.cv_count != len(CV_NAMES):
-            found, expected = f"{reference.cv_count} columns", f"one per CV: {', '.join(CV_NAMES)} [m3/h]"
-            raise InputError(f"{place}reference.setpoints", found, expected)
+        found, expected = f"{reference.cv_count} columns", f"one per CV: {', '.join(CV_NAMES)} [m3/h]"
+        require(reference.cv_count == len(CV_NAMES), f"{place}reference.setpoints", found, expected)
         return reference

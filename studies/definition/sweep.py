@@ -15,12 +15,14 @@ from typing import Any, TypeVar
 
 import msgspec
 from msgspec import UNSET
+from msgspec.structs import replace
 
 from jaxmpc.controller.measurement import FAULTS
 from jaxmpc.decoding import decode
 from jaxmpc.errors import InputError, near
 from jaxmpc.process.well.equations import CV_NAMES
-from studies.definition.fields import FIELDS, similar_end
+from studies.definition.fields import FIELDS, find
+from studies.definition.refusing import require
 from studies.definition.sections import (
     STORABLE,
     Axis,
@@ -42,30 +44,21 @@ T = TypeVar("T")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StudyDefinition:
-    """A sweep study as written, every section decoded.
-
-    Attributes:
-        study, axes, sampling, store, quick: the sections of the file.
-        search: what is sought along the axes; None for a study that lists its scenarios.
-        base: settings by key (`fields.FIELDS`), only those that are given; besides, ``reference`` may be an
-            `ReferenceDefinition`, ``disturbance`` is a tuple of `PressureStep` and ``sensor_fault`` one of `FaultSection`.
-        places: path of every axis in the file, for errors.
-        folder: that CSV files are relative to.
-        body: content of the file, from which `from_dict` makes the same definition again.
-        is_cut: whether this is the quick version of it.
-    """
+    """A sweep study as written, every section decoded."""
 
     study: StudySection
+    # settings by key (`fields.FIELDS`), only those that are given; besides, reference may be an
+    # `ReferenceDefinition`, disturbance is a tuple of `PressureStep` and sensor_fault one of `FaultSection`
     base: dict[str, Any]
     axes: tuple[Axis, ...]
     sampling: Sampling
     store: Store
     quick: Quick | None
-    places: tuple[str, ...]
-    folder: str = "."
-    body: dict[str, Any] = dataclasses.field(default_factory=dict)
-    is_cut: bool = False
-    search: Search | None = None
+    places: tuple[str, ...]  # path of every axis in the file, for errors
+    folder: str = "."  # that CSV files are relative to
+    body: dict[str, Any] = dataclasses.field(default_factory=dict)  # of the file, as `from_dict` takes it
+    is_cut: bool = False  # whether this is the quick version of it
+    search: Search | None = None  # what is sought along the axes; None for a study that lists its scenarios
 
     @classmethod
     def from_dict(cls, body: dict[str, Any], folder: str | Path = ".") -> StudyDefinition:
@@ -78,12 +71,12 @@ class StudyDefinition:
         Raises:
             InputError: naming the path of the field, for unknown or missing keys and wrong types.
         """
-        if isinstance(body, dict):
-            _check_plain(body)
-        file = _convert({"study": {}} | body if isinstance(body, dict) else body, StudyFile, "")
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", file.study.name):
-            expected = "up to 100 letters, digits, '-', '_' and '.': it names the folder of the results"
-            raise InputError("study.name", file.study.name, expected)
+        require(isinstance(body, dict), "study definition", body, "a table")
+        _check_plain(body)
+        file = _convert({"study": {}} | body, StudyFile, "")
+        named = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", file.study.name)
+        expected = "up to 100 letters, digits, '-', '_' and '.': it names the folder of the results"
+        require(named, "study.name", file.study.name, expected)
         if file.search is not None and "sampling" in body:
             raise InputError("sampling", body["sampling"], "no such table: [search] draws from the axes")
         out = cls(
@@ -98,9 +91,9 @@ class StudyDefinition:
             body=body,
             search=file.search,
         )
-        for i, name in enumerate(out.store.trajectories):
-            if name in out.store.trajectories[:i]:
-                raise InputError(f"store.trajectories[{i}]", name, "each trajectory once")
+        kept = file.store.trajectories
+        for i, name in enumerate(kept):
+            require(name not in kept[:i], f"store.trajectories[{i}]", name, "each trajectory once")
         if file.quick is not None:
             out.cut()  # so that a mistake in it is found by every run
         return out
@@ -114,46 +107,41 @@ class StudyDefinition:
         quick = self.quick
         if quick is None:
             raise InputError("quick", "nothing", "a table [quick]: this study has no quick version")
-        firsts = [axis.key if axis.keys is UNSET else (axis.keys or [UNSET])[0] for axis in self.axes]
+        known = [str(axis.key if axis.keys is UNSET else (axis.keys or [UNSET])[0]) for axis in self.axes]
         axes, places = list(self.axes), list(self.places)
         for key, body in quick.axes.items():
             place = f'quick.axes."{key}"'
-            if key not in firsts:
-                known = [str(first) for first in firsts]
-                raise InputError(
-                    place, body, f"the (first) key of an axis: {', '.join(known)}", near(key, known)
-                )
-            i, change = firsts.index(key), _convert(body, Cut, place)
-            given = [name for name in ("values", "count", "keep") if getattr(change, name) is not UNSET]
-            if len(given) != 1:
-                raise InputError(place, given or "nothing", "exactly one of values, count and keep")
-            if given == ["values"]:
-                sources = dict.fromkeys(("range", "distribution", "csv", "keep"), UNSET)
-                axes[i] = msgspec.structs.replace(axes[i], values=change.values, **sources)
-            elif given == ["keep"]:
-                axes[i] = msgspec.structs.replace(axes[i], keep=change.keep)
-            else:
+            if key not in known:
+                expected = f"the (first) key of an axis: {', '.join(known)}"
+                raise InputError(place, body, expected, near(key, known))
+            i, change = known.index(key), _convert(body, Cut, place)
+            given = {
+                name: value for name, value in msgspec.structs.asdict(change).items() if value is not UNSET
+            }
+            require(len(given) == 1, place, list(given) or "nothing", "exactly one of values, count and keep")
+            if "values" in given:
+                given |= dict.fromkeys(("range", "distribution", "csv", "keep"), UNSET)
+                places[i] = place
+            elif "count" in given:
                 whole = axes[i].range
                 if not isinstance(whole, Range):
                     raise InputError(f"{place}.count", change.count, "values or keep: this axis has no range")
-                axes[i] = msgspec.structs.replace(
-                    axes[i], range=msgspec.structs.replace(whole, count=change.count)
-                )
-            places[i] = place if given == ["values"] else places[i]
+                given = {"range": replace(whole, **given)}
+            axes[i] = replace(axes[i], **given)
         sampling, study, search = self.sampling, self.study, self.search
         if quick.count is not UNSET:
-            if sampling.count is UNSET:
-                raise InputError("quick.count", quick.count, "nothing: [sampling] has no count either")
-            sampling = msgspec.structs.replace(sampling, count=quick.count)
+            counted = sampling.count is not UNSET
+            require(counted, "quick.count", quick.count, "nothing: [sampling] has no count either")
+            sampling = replace(sampling, count=quick.count)
         if quick.batches is not UNSET:
             if search is None:
                 raise InputError("quick.batches", quick.batches, "nothing: there is no [search]")
-            search = msgspec.structs.replace(search, batches=quick.batches)
+            search = replace(search, batches=quick.batches)
         if quick.chunk_size is not UNSET:
-            study = msgspec.structs.replace(study, chunk_size=quick.chunk_size)
+            study = replace(study, chunk_size=quick.chunk_size)
         return dataclasses.replace(
             self,
-            study=msgspec.structs.replace(study, name=f"{study.name}-quick"),
+            study=replace(study, name=f"{study.name}-quick"),
             base={**self.base, **settings(quick.base, "quick.base")},
             axes=tuple(axes),
             places=tuple(places),
@@ -202,8 +190,8 @@ def _check_plain(body: dict[str, Any]) -> None:
         for path, value in level:
             if isinstance(value, dict):
                 for key in value:
-                    if not isinstance(key, str) or not key.isprintable():
-                        raise InputError(path or "study definition", key, "keys of printable text")
+                    printable = isinstance(key, str) and key.isprintable()
+                    require(printable, path or "study definition", key, "keys of printable text")
                 inner += [(f"{path}.{key}".lstrip("."), entry) for key, entry in value.items()]
             elif isinstance(value, (list, tuple)):
                 inner += [(f"{path}[{i}]", entry) for i, entry in enumerate(value)]
@@ -221,8 +209,7 @@ def _check_plain(body: dict[str, Any]) -> None:
 
 def settings(body: Any, path: str) -> dict[str, Any]:
     """A base table as settings by key, each of its own type; `InputError` with the full path otherwise."""
-    if not isinstance(body, dict):
-        raise InputError(path, body, "a table of settings")
+    require(isinstance(body, dict), path, body, "a table of settings")
     out: dict[str, Any] = {}
 
     def walk(table: dict[str, Any], prefix: str) -> None:
@@ -246,9 +233,7 @@ def settings(body: Any, path: str) -> dict[str, Any]:
                 if isinstance(value, dict) and value:  # name the whole key that was meant
                     inner = next(iter(value))
                     key, value, where = f"{key}.{inner}", value[inner], f"{where}.{inner}"
-                raise InputError(
-                    where, value, "a key of docs/studies.md", near(key, FIELDS) or similar_end(key)
-                )
+                find(where, key, value)
 
     walk(body, "")
     return out
@@ -257,16 +242,16 @@ def settings(body: Any, path: str) -> dict[str, Any]:
 def _events(value: Any, table: str, where: str) -> tuple[Any, ...]:
     """What ``[[base.disturbance]]`` or ``[[base.sensor_fault]]`` lists, each number checked by its key."""
     kind, what = _EVENTS[table]
-    if not isinstance(value, list):
-        raise InputError(where, value, f"{what}, each headed [[{where}]]")
+    require(isinstance(value, list), where, value, f"{what}, each headed [[{where}]]")
     events = tuple(_convert(event, kind, f"{where}[{i}]") for i, event in enumerate(value))
     for i, event in enumerate(events):
         for name in ("time", "offset", "duration", "size"):
             if (given := getattr(event, name, UNSET)) is not UNSET:
                 FIELDS[f"{table}.{name}"].check(f"{where}[{i}].{name}", given)
-        if table == "disturbance" and i and event.time <= events[i - 1].time:
-            expected = f"a time after the step before it, {events[i - 1].time:g} s"
-            raise InputError(f"{where}[{i}].time", event.time, expected)
+        if table == "disturbance" and i:
+            before = events[i - 1].time
+            expected = f"a time after the step before it, {before:g} s"
+            require(event.time > before, f"{where}[{i}].time", event.time, expected)
     return events
 
 

@@ -9,23 +9,17 @@ from typing import Any
 
 from jaxmpc.errors import InputError, near
 from studies.definition.fields import Field
+from studies.definition.refusing import require
 
 
 def read_rows(folder: Path, name: str, place: str) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of a file; empty lines do not count.
-
-    Args:
-        folder: that `name` is relative to.
-        name: of the file.
-        place: path in the definition of the key that names it, for errors.
-    """
+    """Header and rows of a file, named by a key at some place of the definition; empty lines do not count."""
     try:
         with open(folder / name, newline="", encoding="utf-8-sig") as file:
             rows = [row for row in csv.reader(file) if row]
     except (OSError, ValueError, csv.Error) as error:
         raise InputError(place, str(folder / name), f"a readable CSV file ({error})") from None
-    if not rows:
-        raise InputError(place, name, "a CSV file with a header and one row or more")
+    require(rows, place, name, "a CSV file with a header and one row or more")
     return [column.strip() for column in rows[0]], rows[1:]
 
 
@@ -38,13 +32,13 @@ def read_columns(
         InputError: for columns that are missing or twice there, rows of another length, and values that are refused.
     """
     header, rows = read_rows(folder, name, place)
+    expected = f"one of the columns of {name}: {', '.join(header)} (each name once)"
     for column in columns:
         if header.count(column) != 1:
-            expected = f"one of the columns of {name}: {', '.join(header)} (each name once)"
             raise InputError(place, column, expected, near(column, header))
+    expected = f"{len(header)} cells, as in the header"
     for n, row in enumerate(rows, start=2):
-        if len(row) != len(header):
-            raise InputError(f"{place} ({name}, row {n})", row, f"{len(header)} cells, as in the header")
+        require(len(row) == len(header), f"{place} ({name}, row {n})", row, expected)
     values, paths = [], []
     for field, column in zip(fields, columns, strict=True):
         at = header.index(column)

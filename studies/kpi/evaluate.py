@@ -9,14 +9,17 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Array
 
-from jaxmpc.controller.measurement import GOOD
 from jaxmpc.errors import InputError
-from jaxmpc.status import OPTIMAL
 from studies.definition.presets import CHOKE, GAS, LIFT, OIL
 from studies.kpi import loop as kpi
-from studies.kpi.sweep import KPIS, Channels, Run, Tuned, rounding, run_kpis
+from studies.kpi.sweep import KPIS, RECORD, Channels, Run, Tuned, rounding, run_kpis, run_of
 
 NEAR_CLOSED = 50.0  # % choke, the border in the thesis's statement on oscillation
+STORED = {
+    "cv": "measurement",
+    "mv": "position",
+    "mv_demand": "demand",
+}  # what fields of runs are called in results
 
 
 def completed(data: xr.Dataset) -> xr.Dataset:
@@ -63,8 +66,10 @@ def key_figures(data: xr.Dataset) -> xr.Dataset:
     for i in range(data.sizes["controller"]):
         run = data.isel(controller=i)
         tuned = Tuned(*(run[f"tuning_{name}"].values for name in Tuned._fields))
-        dt, span = sampling_interval(data), run.mean_move_window.item()
-        row = _figures(_arrays(run), tuned, late, dt, windows, span, channels)
+        span = run.mean_move_window.item()
+        fields = {name: run[STORED.get(name, name)].values for name in RECORD}
+        arrays = run_of(fields, run.setpoint.values, window)
+        row = _figures(arrays, tuned, late, float(data.attrs["dt"]), windows, span, channels)
         rows.append(row | {"wall_time": run.wall_time.values})
     out = {}
     for key, (axes, unit, meaning) in ({k.name: (k.dims, k.unit, k.long_name) for k in KPIS} | _OWN).items():
@@ -72,22 +77,9 @@ def key_figures(data: xr.Dataset) -> xr.Dataset:
         attrs = {"units": unit, "long_name": meaning}
         out[key] = xr.DataArray(values, dims=("controller", *axes), attrs=attrs)
     coords: dict = {name: data[name] for name in ("controller", "label", "cv", "mv", "cv_unit", "mv_unit")}
-    starts = np.array([data.time.values[window == w][0] for w in range(windows)])
+    starts = np.array([data.time.values[samples[0]] for samples in _windows(data)])
     coords["window"] = ("window", starts, {"long_name": "start of the setpoint window", "units": "s"})
     return xr.Dataset(out, coords)
-
-
-def _arrays(run: xr.Dataset) -> Run:
-    """A stored run as `run_kpis` takes it."""
-    stored = {"cv": "measurement", "mv": "position", "mv_demand": "demand"}
-    same = ("setpoint", "move", "window", "objective", "gap", "solve_time")
-    return Run(
-        **{name: run[stored.get(name, name)].values for name in (*stored, *same)},
-        optimal=run.status.values == OPTIMAL,
-        fallback=run.fallback.values != 0,
-        left_out=run.quality.values != GOOD,
-        off=run.off.values != 0,
-    )
 
 
 @functools.partial(jax.jit, static_argnames=("windows", "span", "channels"))
@@ -109,42 +101,28 @@ def _figures(
     }
 
 
-def sampling_interval(data: xr.Dataset) -> float:
-    """Sampling interval of the results [s]."""
-    return float(data.attrs["dt"])
+def _windows(data: xr.Dataset) -> list[np.ndarray]:
+    """Positions of the samples of each setpoint window."""
+    window = data.window.values
+    return [np.flatnonzero(window == w) for w in range(int(window.max()) + 1)]
 
 
 def window_deviation(data: xr.Dataset, controller: str) -> np.ndarray:
-    """Mean absolute deviation from the setpoint in every window, ``"window cv"`` [CV unit].
-
-    Args:
-        data: results.
-        controller: name of a finished run.
-    """
+    """Mean absolute deviation of a finished run from the setpoint in every window, ``"window cv"`` [CV unit]."""
     run = data.sel(controller=controller)
     away = np.abs(run.measurement.values - run.setpoint.values)
-    window = data.window.values
-    return np.array([away[window == w].mean(axis=0) for w in range(int(window.max()) + 1)])
+    return np.array([away[samples].mean(axis=0) for samples in _windows(data)])
 
 
 def final_deviation(data: xr.Dataset, controller: str) -> np.ndarray:
-    """Mean deviation over the last quarter of every window, in deadzone half widths.
-
-    Args:
-        data: results.
-        controller: name of a finished run.
+    """Mean deviation of a finished run over the last quarter of every window, in deadzone half widths.
 
     Returns:
         ``"window cv"``: signed, measured minus setpoint over deadzone; a swing around the setpoint cancels.
     """
     run = data.sel(controller=controller)
-    window = data.window.values
     scaled = (run.measurement.values - run.setpoint.values) / run.tuning_deadzone.values
-    out = []
-    for w in range(int(window.max()) + 1):
-        samples = np.flatnonzero(window == w)
-        out.append(scaled[samples[(3 * len(samples)) // 4 :]].mean(axis=0))
-    return np.array(out)
+    return np.array([scaled[samples[3 * len(samples) // 4 :]].mean(axis=0) for samples in _windows(data)])
 
 
 def distance_to_reach(data: xr.Dataset, refine: int = 8) -> np.ndarray:
@@ -164,9 +142,6 @@ def distance_to_reach(data: xr.Dataset, refine: int = 8) -> np.ndarray:
         share = (at - low).reshape([-1 if a == axis else 1 for a in range(3)])
         rate = np.take(rate, low, axis) * (1 - share) + np.take(rate, low + 1, axis) * share
     half = data.tuning_deadzone.isel(controller=0).values
-    first = [
-        int(np.flatnonzero(data.window.values == w)[0]) for w in range(int(data.window.values.max()) + 1)
-    ]
-    setpoints = data.setpoint.values[first]
+    setpoints = data.setpoint.values[[samples[0] for samples in _windows(data)]]
     away = np.abs(rate[None] - setpoints[:, None, None, :]) / half
     return np.nanmin(away.max(axis=-1), axis=(1, 2))

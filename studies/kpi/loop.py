@@ -20,43 +20,43 @@ import jaxmpc  # noqa: F401  (switches JAX to float64)
 
 MOVE_THRESHOLD = 0.05  # % choke
 
+Samples = Float[ArrayLike, " sample"]  # moves or positions of one MV, or a number per sample
+Labels = Int[ArrayLike, " sample"]
+Cvs = Float[ArrayLike, "sample cv"]
+PerCv = Float[ArrayLike, " cv"]
+Values = Float[ArrayLike, "sample channel"]
+Limits = Float[ArrayLike, " channel"]
+Number = Float[Array, ""]
+Count = Int[Array, ""]
+Statistic = Float[Array, " cv"]
 
-def moves_of(position: Float[ArrayLike, " sample"], start) -> Float[Array, " sample"]:
+
+def moves_of(position: Samples, start) -> Float[Array, " sample"]:
     """m[0] = u[0] - start, m[k] = u[k] - u[k-1]; `start` is the position before the run, same unit."""
     return jnp.diff(jnp.asarray(position), prepend=jnp.asarray(start)[None])
 
 
-def travel(move: Float[ArrayLike, " sample"]) -> Float[Array, ""]:
+def travel(move: Samples) -> Number:
     """Travel sum_k |m[k]|, in the unit of the move: the wear of a choke, in %."""
     return jnp.abs(jnp.asarray(move)).sum()
 
 
-def move_count(move: Float[ArrayLike, " sample"], threshold: float = MOVE_THRESHOLD) -> Int[Array, ""]:
+def move_count(move: Samples, threshold: float = MOVE_THRESHOLD) -> Count:
     """Number of samples with |m[k]| > threshold."""
     return (jnp.abs(jnp.asarray(move)) > threshold).sum()
 
 
 def reversal_events(
-    move: Float[ArrayLike, " sample"],
-    threshold: float = MOVE_THRESHOLD,
-    segment: Int[ArrayLike, " sample"] | None = None,
+    move: Samples, threshold: float = MOVE_THRESHOLD, segment: Labels | None = None
 ) -> Bool[Array, " sample"]:
     """Samples at which the MV turns round.
 
-    Args:
-        move: m.
-        threshold: smallest |m| that counts as a move, same unit.
-        segment: a label per sample; only moves with the same label, 0 or more, are compared. Without it, all.
-
-    Returns:
-        ``"sample"``: |m[k]| > threshold and sign m[k] = -sign m[j], where j < k is the move before it and
-        segment[j] = segment[k] >= 0.
+    |m[k]| > threshold and sign m[k] = -sign m[j], where j < k is the move before it; given labels `segment`, only moves
+    with the same label, 0 or more, are compared.
     """
     move = jnp.asarray(move)
     moved = jnp.abs(move) > threshold
-    index = jnp.arange(move.shape[0])
-    latest = jax.lax.cummax(jnp.where(moved, index, -1))  # the latest move at or before each sample
-    before = jnp.concatenate([jnp.full((1,), -1, latest.dtype), latest[:-1]])
+    before = _before(moved)
     turned = moved & (before >= 0) & (jnp.sign(move) * jnp.sign(move[before]) < 0)
     if segment is None:
         return turned
@@ -64,8 +64,14 @@ def reversal_events(
     return turned & (segment >= 0) & (segment[before] == segment)
 
 
+def _before(event: Bool[Array, " sample"]) -> Int[Array, " sample"]:
+    """The sample of the latest event before each sample, -1 without one."""
+    latest = jax.lax.cummax(jnp.where(event, jnp.arange(event.shape[0]), -1))
+    return jnp.concatenate([jnp.full((1,), -1, latest.dtype), latest[:-1]])
+
+
 def count_by_segment(
-    event: Bool[ArrayLike, " sample"], segment: Int[ArrayLike, " sample"], segments: int
+    event: Bool[ArrayLike, " sample"], segment: Labels, segments: int
 ) -> Int[Array, " segment"]:
     """Number of events with each label 0..segments-1; labels below 0 are left out."""
     label = jnp.arange(segments)[:, None]
@@ -85,97 +91,76 @@ def second_halves(window: Int[np.ndarray, " sample"]) -> Int[np.ndarray, " sampl
     return out
 
 
-def dwell(
-    move: Float[ArrayLike, " sample"], dt: float, threshold: float = MOVE_THRESHOLD
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def dwell(move: Samples, dt: float, threshold: float = MOVE_THRESHOLD) -> tuple[Number, Number]:
     """Mean and shortest time between successive moves [s].
 
     With moves at k1 < ... < kn: mean (kn - k1) dt / (n - 1), shortest min_i (k(i+1) - k(i)) dt; NaN if n < 2.
     """
     moved = jnp.abs(jnp.asarray(move)) > threshold
-    index = jnp.arange(moved.shape[0])
-    latest = jax.lax.cummax(jnp.where(moved, index, -1))
-    before = jnp.concatenate([jnp.full((1,), -1, latest.dtype), latest[:-1]])
+    before = _before(moved)
     follows = moved & (before >= 0)
-    distance = jnp.where(follows, (index - before) * dt, 0.0)
+    distance = jnp.where(follows, (jnp.arange(moved.shape[0]) - before) * dt, 0.0)
     count = follows.sum()
     mean = jnp.where(count > 0, distance.sum() / jnp.maximum(count, 1), jnp.nan)
     shortest = jnp.where(follows, distance, jnp.inf).min()
     return mean, jnp.where(count > 0, shortest, jnp.nan)
 
 
-def mean_absolute_deviation(
-    cv: Float[ArrayLike, "sample cv"], setpoint: Float[ArrayLike, "sample cv"]
-) -> Float[Array, " cv"]:
+def mean_absolute_deviation(cv: Cvs, setpoint: Cvs) -> Statistic:
     """mean_k |y[k] - r[k]| [CV unit]."""
     return jnp.abs(jnp.asarray(cv) - jnp.asarray(setpoint)).mean(axis=0)
 
 
-def integral_absolute_error(
-    cv: Float[ArrayLike, "sample cv"], setpoint: Float[ArrayLike, "sample cv"], dt: float
-) -> Float[Array, " cv"]:
+def integral_absolute_error(cv: Cvs, setpoint: Cvs, dt: float) -> Statistic:
     """IAE = dt sum_k |y[k] - r[k]| [CV unit s]."""
     return dt * jnp.abs(jnp.asarray(cv) - jnp.asarray(setpoint)).sum(axis=0)
 
 
-def time_outside_deadzone(
-    cv: Float[ArrayLike, "sample cv"],
-    setpoint: Float[ArrayLike, "sample cv"],
-    deadzone: Float[ArrayLike, " cv"],
-    dt: float,
-) -> Float[Array, " cv"]:
+def time_outside_deadzone(cv: Cvs, setpoint: Cvs, deadzone: PerCv, dt: float) -> Statistic:
     """Time with |y[k] - r[k]| > c [s], c the half width of the deadzone: dt times the number of samples."""
     outside = jnp.abs(jnp.asarray(cv) - jnp.asarray(setpoint)) > jnp.asarray(deadzone)
     return dt * outside.sum(axis=0)
 
 
 def limit_excess(
-    value: Float[ArrayLike, "sample channel"],
-    low: Float[ArrayLike, " channel"],
-    high: Float[ArrayLike, " channel"],
+    value: Values, low: Limits, high: Limits, tolerance: Limits | float = 0.0
 ) -> Float[Array, "sample channel"]:
-    """How far a value is outside its limits, max(low - v, v - high, 0), same unit."""
+    """How far a value is outside its limits, max(low - v, v - high, 0), same unit; 0 up to `tolerance` (rounding)."""
     value = jnp.asarray(value)
-    return jnp.maximum(jnp.maximum(jnp.asarray(low) - value, value - jnp.asarray(high)), 0.0)
+    excess = jnp.maximum(jnp.maximum(jnp.asarray(low) - value, value - jnp.asarray(high)), 0.0)
+    return jnp.where(excess <= jnp.asarray(tolerance), 0.0, excess)
 
 
 def limit_violations(
-    value: Float[ArrayLike, "sample channel"],
-    low: Float[ArrayLike, " channel"],
-    high: Float[ArrayLike, " channel"],
-    tolerance: Float[ArrayLike, " channel"] | float = 0.0,
+    value: Values, low: Limits, high: Limits, tolerance: Limits | float = 0.0
 ) -> Int[Array, " channel"]:
-    """Number of samples that are outside their limits by more than `tolerance` (rounding), same unit."""
-    return (limit_excess(value, low, high) > jnp.asarray(tolerance)).sum(axis=0)
+    """Number of samples with a `limit_excess`."""
+    return (limit_excess(value, low, high, tolerance) > 0).sum(axis=0)
 
 
 def largest_excess(
-    value: Float[ArrayLike, "sample channel"],
-    low: Float[ArrayLike, " channel"],
-    high: Float[ArrayLike, " channel"],
-    tolerance: Float[ArrayLike, " channel"] | float = 0.0,
+    value: Values, low: Limits, high: Limits, tolerance: Limits | float = 0.0
 ) -> Float[Array, " channel"]:
-    """Largest `limit_excess` over the run, 0 where `limit_violations` counts nothing; same unit."""
-    excess = limit_excess(value, low, high)
-    return jnp.where(excess <= jnp.asarray(tolerance), 0.0, excess).max(axis=0)
+    """Largest `limit_excess` over the run."""
+    return limit_excess(value, low, high, tolerance).max(axis=0)
 
 
-def volume(rate: Float[ArrayLike, " sample"], dt: float) -> Float[Array, ""]:
+def volume(rate: Samples, dt: float) -> Number:
     """Integral of a rate that is held from sample to sample, dt / 3600 sum_k q[k]: m3/h gives m3."""
     return dt / 3600.0 * jnp.asarray(rate).sum()
 
 
 def closed_loop_cost(
-    cv: Float[ArrayLike, "sample cv"],
-    setpoint: Float[ArrayLike, "sample cv"],
+    cv: Cvs,
+    setpoint: Cvs,
     move: Float[ArrayLike, "sample mv"],
     *,
-    cv_weight: Float[ArrayLike, " cv"],
-    soft_quadratic: Float[ArrayLike, " cv"],
-    soft_linear: Float[ArrayLike, " cv"],
-    deadzone: Float[ArrayLike, " cv"],
+    cv_weight: PerCv,
+    soft_quadratic: PerCv,
+    soft_linear: PerCv,
+    deadzone: PerCv,
     move_weight: Float[ArrayLike, " mv"],
-) -> Float[Array, ""]:
+) -> Number:
     """Tracking and move cost of (6.6) on what happened instead of a prediction, per sample.
 
     mean_k [sum_i (Q e^2 + S h^2 + s h) + sum_j P m^2] with e = |y[k] - r[k]| and h = max(e - c, 0); weights as in
@@ -189,33 +174,27 @@ def closed_loop_cost(
     return ((tracking + soft).sum(axis=1) + moves.sum(axis=1)).mean()
 
 
-def windowed_mean(move: Float[ArrayLike, " sample"], samples: int) -> Float[Array, " sample"]:
+def windowed_mean(move: Samples, samples: int) -> Float[Array, " sample"]:
     """Mean of the last n = `samples` moves up to and including k (6.6); moves before the run are zero."""
     total = jnp.cumsum(jnp.asarray(move))
     earlier = jnp.concatenate([jnp.zeros(samples, total.dtype), total])[: total.shape[0]]
     return (total - earlier) / samples
 
 
-def mean_move_stops(
-    move: Float[ArrayLike, " sample"], samples: int, limit: float, threshold: float = MOVE_THRESHOLD
-) -> Int[Array, ""]:
+def mean_move_stops(move: Samples, samples: int, limit: float, threshold: float = MOVE_THRESHOLD) -> Count:
     """Steps of the staircase: how often opening pauses because the windowed mean is above its limit.
 
     Counts opening moves m[k] > threshold whose opening move before it, at j < k - 1, brought the windowed
     mean above `limit`, with no closing move in between: opening went on after a pause.
     """
     move = jnp.asarray(move)
-    mean = windowed_mean(move, samples)
     opening = move > threshold
-    index = jnp.arange(move.shape[0])
-    last_opening = jax.lax.cummax(jnp.where(opening, index, -1))
-    before = jnp.concatenate([jnp.full((1,), -1, last_opening.dtype), last_opening[:-1]])
-    last_closing = jax.lax.cummax(jnp.where(move < -threshold, index, -1))
-    follows = opening & (before >= 0) & (index - before > 1) & (last_closing < before)
-    return (follows & (mean[before] > limit)).sum()
+    before, closed = _before(opening), _before(move < -threshold)
+    paused = opening & (before >= 0) & (jnp.arange(move.shape[0]) - before > 1) & (closed < before)
+    return (paused & (windowed_mean(move, samples)[before] > limit)).sum()
 
 
-def opening_above_limit(move: Float[ArrayLike, " sample"], samples: int, limit: float) -> Int[Array, ""]:
+def opening_above_limit(move: Samples, samples: int, limit: float) -> Count:
     """Opening moves made although the mean of the `samples` moves before them was above `limit` (6.6).
 
     Both comparisons allow 1e-6 for rounding, in the unit of the move.
@@ -225,7 +204,7 @@ def opening_above_limit(move: Float[ArrayLike, " sample"], samples: int, limit: 
     return ((before > limit + 1e-6) & (move > 1e-6)).sum()
 
 
-def solve_time_statistics(solve_time: Float[ArrayLike, " sample"]) -> Float[Array, " statistic"]:
+def solve_time_statistics(solve_time: Samples) -> Float[Array, " statistic"]:
     """Median, 99th percentile (linear interpolation) and largest solve time [s]; NaN if one is NaN."""
     value = jnp.asarray(solve_time, dtype=jnp.float64)
     # The bits of floats that are not negative are ordered like the floats, and on a CPU they sort four times as
@@ -240,7 +219,7 @@ def solve_time_statistics(solve_time: Float[ArrayLike, " sample"]) -> Float[Arra
     return jnp.where(jnp.isnan(value).any(), jnp.nan, found)
 
 
-def largest_gap(gap: Float[ArrayLike, " sample"]) -> Float[Array, ""]:
+def largest_gap(gap: Samples) -> Number:
     """Largest relative gap between objective and bound; infinite if a sample has none (NaN)."""
     gap = jnp.asarray(gap)
     return jnp.where(jnp.isnan(gap), jnp.inf, gap).max()

@@ -29,25 +29,18 @@ DEVIATION = "deviation"
 CHANNELS = {(): (), ("cv",): CV_NAMES, ("mv",): MV_NAMES}
 FIGURES = {kpi.name: kpi for kpi in KPIS}
 CLOCK = "solve_time"  # figures of the clock differ from run to run
-THESIS_DEADZONE = tuple(presets.tuning_fields("thesis")["deadzone"][name] for name in CV_NAMES)
+THESIS_DEADZONE = tuple(presets.TUNINGS["thesis"]["deadzone"][name] for name in CV_NAMES)
 DIRECTIONS = ("minimize", "maximize")
 
 
 @dataclasses.dataclass(frozen=True)
 class Objective:
-    """One objective.
-
-    Attributes:
-        name: as in the definition.
-        direction: ``minimize`` or ``maximize``.
-        figure: key figure that it is made of.
-        channel: position of its CV or MV; None where the figure has no channels, and for the combined deviation.
-    """
+    """One objective, its name and direction as in the definition."""
 
     name: str
-    direction: str
-    figure: str
-    channel: int | None = None
+    direction: str  # ``minimize`` or ``maximize``
+    figure: str  # key figure that it is made of
+    channel: int | None = None  # position of its CV or MV; None without, and for the combined deviation
 
     def values(self, fields: Mapping[str, Any]) -> np.ndarray:
         """Per scenario, from the stored variables ``"scenario ..."`` by name; NaN for a run that is not complete."""
@@ -60,12 +53,7 @@ class Objective:
 
 
 def objective(path: str, name: str, direction: str = "minimize") -> Objective:
-    """The objective of a name.
-
-    Args:
-        path: where the name stands, for errors.
-        name: of the objective.
-        direction: ``minimize`` or ``maximize``.
+    """The objective of a name; `path` is where the name stands.
 
     Raises:
         InputError: for an unknown name, a figure with channels without one, and figures of the clock.
@@ -123,23 +111,18 @@ def unbeaten(values: np.ndarray) -> np.ndarray:
     """Which points no other point beats: as good in everything and better in something, smaller being better.
 
     Equal points do not beat each other; points with a value that is not finite are never among them and beat nothing.
-
-    Args:
-        values: ``"point objective"``.
+    Values are ``"point objective"``.
     """
-    finite = np.all(np.isfinite(values), axis=1)
-    out, rivals = finite.copy(), values[finite]
-    for i in np.flatnonzero(finite):
-        as_good, better = (rivals <= values[i]).all(axis=1), (rivals < values[i]).any(axis=1)
-        out[i] = not (as_good & better).any()
-    return out
+    on, rivals = np.zeros(len(values), dtype=bool), values[:0]
+    for i in np.lexsort(values.T[::-1]):  # whoever beats a point comes before it
+        beaten = (rivals <= values[i]).all(axis=1) & (rivals < values[i]).any(axis=1)
+        if np.isfinite(values[i]).all() and not beaten.any():
+            on[i], rivals = True, np.vstack([rivals, values[i]])
+    return on
 
 
 def front(store: str | Path) -> np.ndarray:
-    """Numbers of the stored scenarios that no other beats, the best in the first objective first.
-
-    Args:
-        store: of a search, complete or not.
+    """Numbers of the scenarios that no other beats in the store of a search, the best in the first objective first.
 
     Raises:
         InputError: if there is no store, or it is not that of a search.

@@ -11,31 +11,21 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-import jaxmpc  # noqa: F401  (switches JAX to float64)
+from studies.kpi.loop import Cvs, Labels, PerCv
 
 
 class Settling(NamedTuple):
-    """How one run settles after its setpoint changes.
+    """How one run settles after its setpoint changes; times are NaN without any."""
 
-    Attributes:
-        changes: ``"cv"``, windows that begin with a change of this CV's setpoint.
-        mean: ``"cv"``, mean settling time over them [s]; NaN without any.
-        longest: ``"cv"``, longest of them [s]; NaN without any.
-        unsettled: ``"cv"``, how many of them end outside the tolerance.
-    """
-
-    changes: Int[Array, " cv"]
-    mean: Float[Array, " cv"]
-    longest: Float[Array, " cv"]
-    unsettled: Int[Array, " cv"]
+    changes: Int[Array, " cv"]  # windows that begin with a change of this CV's setpoint
+    mean: Float[Array, " cv"]  # settling time over them [s]
+    longest: Float[Array, " cv"]  # of them [s]
+    unsettled: Int[Array, " cv"]  # how many of them end outside the tolerance
 
 
-def window_bounds(
-    window: Int[ArrayLike, " sample"],
-) -> tuple[Int[Array, " sample"], Int[Array, " sample"]]:
+def window_bounds(window: Labels) -> tuple[Int[Array, " sample"], Int[Array, " sample"]]:
     """First and last sample of the window that each sample is in."""
     window = jnp.asarray(window)
     index = jnp.arange(window.shape[0])
@@ -46,7 +36,7 @@ def window_bounds(
     return start, jax.lax.cummin(last, reverse=True)
 
 
-def late_segment(start: Int[ArrayLike, " sample"], end: Int[ArrayLike, " sample"]) -> Int[Array, " sample"]:
+def late_segment(start: Labels, end: Labels) -> Int[Array, " sample"]:
     """First sample of the window in its second half (from sample n // 2 of n), -1 elsewhere.
 
     The `segment` of `studies.kpi.loop.reversal_events` that leaves hunting: the samples of `studies.kpi.loop.second_halves`.
@@ -55,12 +45,7 @@ def late_segment(start: Int[ArrayLike, " sample"], end: Int[ArrayLike, " sample"
     return jnp.where(jnp.arange(start.shape[0]) - start >= (end - start + 1) // 2, start, -1)
 
 
-def setpoint_change(
-    cv: Float[ArrayLike, "sample cv"],
-    setpoint: Float[ArrayLike, "sample cv"],
-    tolerance: Float[ArrayLike, " cv"],
-    start: Int[ArrayLike, " sample"],
-) -> Float[Array, "sample cv"]:
+def setpoint_change(cv: Cvs, setpoint: Cvs, tolerance: PerCv, start: Labels) -> Float[Array, "sample cv"]:
     """How much the setpoint changed when the window of each sample began [CV unit].
 
     That is r[k] - r[a - 1], with a the first sample of the window. The first window has no setpoint before it:
@@ -73,21 +58,11 @@ def setpoint_change(
     return jnp.where((start == 0)[:, None], initial, later)
 
 
-def overshoot(
-    cv: Float[ArrayLike, "sample cv"],
-    setpoint: Float[ArrayLike, "sample cv"],
-    change: Float[ArrayLike, "sample cv"],
-) -> Float[Array, " cv"]:
+def overshoot(cv: Cvs, setpoint: Cvs, change: Cvs) -> Float[Array, " cv"]:
     """Largest excursion beyond a new setpoint, max_k max(sign(d[k]) (y[k] - r[k]), 0) [CV unit].
 
-    Args:
-        cv: y.
-        setpoint: r.
-        change: d, from `setpoint_change`; samples with d = 0 do not count.
-
-    Returns:
-        ``"cv"``: the largest over all windows that begin with a change of this CV; NaN without any, or if one of
-        their samples is NaN.
+    Over all windows that begin with a change d of this CV, from `setpoint_change`; NaN without any, or if one of their
+    samples is NaN.
     """
     change = jnp.asarray(change)
     beyond = jnp.sign(change) * (jnp.asarray(cv) - jnp.asarray(setpoint))
@@ -96,25 +71,13 @@ def overshoot(
 
 
 def settling(
-    cv: Float[ArrayLike, "sample cv"],
-    setpoint: Float[ArrayLike, "sample cv"],
-    change: Float[ArrayLike, "sample cv"],
-    tolerance: Float[ArrayLike, " cv"],
-    bounds: tuple[Int[ArrayLike, " sample"], Int[ArrayLike, " sample"]],
-    dt: float,
+    cv: Cvs, setpoint: Cvs, change: Cvs, tolerance: PerCv, bounds: tuple[Labels, Labels], dt: float
 ) -> Settling:
-    """Time from a setpoint change until |y - r| <= tolerance for the rest of the window.
+    """Time from a setpoint change until |y - r| <= tolerance [CV unit] for the rest of the window.
 
-    In a window of samples a..b this is (l - a + 1) dt with l the last sample outside, 0 if none is; a window that
-    ends outside has the window's length, and is counted. NaN is outside.
-
-    Args:
-        cv: y.
-        setpoint: r.
-        change: from `setpoint_change`; only windows in which it is not 0 count.
-        tolerance: half width around the setpoint [CV unit].
-        bounds: first and last sample of the windows, from `window_bounds`.
-        dt: sampling interval [s].
+    In a window of samples a..b (`bounds`, from `window_bounds`) this is (l - a + 1) dt with l the last sample outside, 0 if
+    none is; a window that ends outside has the window's length, and is counted. NaN is outside. Only windows count that
+    begin with a `setpoint_change`.
     """
     start, end = (jnp.asarray(bound)[:, None] for bound in bounds)
     index = jnp.arange(start.shape[0])[:, None]

@@ -8,7 +8,7 @@ float, so that a run whose numbers are not all finite can answer NaN instead of 
 from __future__ import annotations
 
 import dataclasses
-import functools
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -138,37 +138,21 @@ ALWAYS = tuple(item.name for item in KPIS[-9:])
 
 
 class Run(NamedTuple):
-    """One run as arrays, fields as in `jaxmpc.loop.trajectory.Trajectory`; `runs_of` gives many, lanes first.
+    """One run as arrays, fields as in `jaxmpc.loop.trajectory.Trajectory`; `runs_of` gives many, lanes first."""
 
-    Attributes:
-        cv: ``"sample cv"``, measured by sensors without fault, noise included.
-        setpoint: ``"sample cv"``, at the same time as `cv`.
-        mv: ``"sample mv"``, position of the actuators.
-        mv_demand: ``"sample mv"``, demand of the controller.
-        move: ``"sample mv"``, demand minus previous demand.
-        window: ``"sample"``, label of the setpoint window.
-        objective: ``"sample"``, of the applied plan, NaN where there was none.
-        gap: ``"sample"``, relative gap, NaN where there was no plan.
-        solve_time: ``"sample"``, of one controller step [s].
-        optimal: ``"sample"``, whether the solve ended optimal.
-        fallback: ``"sample"``, whether the MVs were held.
-        left_out: ``"sample cv"``, whether the measurement was bad.
-        off: ``"sample cv"``, whether the CV was switched off.
-    """
-
-    cv: Any
-    setpoint: Any
-    mv: Any
-    mv_demand: Any
-    move: Any
-    window: Any
-    objective: Any
-    gap: Any
-    solve_time: Any
-    optimal: Any
-    fallback: Any
-    left_out: Any
-    off: Any
+    cv: Any  # "sample cv"
+    setpoint: Any  # "sample cv"
+    mv: Any  # "sample mv", position of the actuators
+    mv_demand: Any  # "sample mv"
+    move: Any  # "sample mv", demand minus previous demand
+    window: Any  # "sample", label of the setpoint window
+    objective: Any  # "sample", of the applied plan, NaN where there was none
+    gap: Any  # "sample", NaN where there was no plan
+    solve_time: Any  # "sample" [s]
+    optimal: Any  # "sample", whether the solve ended optimal
+    fallback: Any  # "sample", whether the MVs were held
+    left_out: Any  # "sample cv", whether the measurement was bad
+    off: Any  # "sample cv", whether the CV was switched off
 
 
 class Tuned(NamedTuple):
@@ -208,15 +192,12 @@ def channels_of(batch: TrajectoryBatch) -> Channels:
         InputError: if one is missing, or a rate is not in m3/h.
     """
     found = []
-    for wanted, names, units, key in (
-        (MV_NAMES, batch.mv_names, batch.mv_units, "mv"),
-        (CV_NAMES, batch.cv_names, batch.cv_units, "cv"),
-    ):
+    for key, wanted in (("mv", MV_NAMES), ("cv", CV_NAMES)):
+        names, units = getattr(batch, f"{key}_names"), getattr(batch, f"{key}_units")
         for name in wanted:
             if name not in names:
-                raise InputError(
-                    f"batch.{key}_names", list(names), f"the well's {key.upper()} {name!r} among them"
-                )
+                expected = f"the well's {key.upper()} {name!r} among them"
+                raise InputError(f"batch.{key}_names", list(names), expected)
             at = names.index(name)
             if name != MV_NAMES[0] and units[at] != RATE_UNIT:
                 raise InputError(f"batch.{key}_units[{at}]", units[at], f"{RATE_UNIT!r}, the unit of {name}")
@@ -237,20 +218,22 @@ def runs_of(batch: TrajectoryBatch, window) -> Run:
     shape = (len(batch), len(batch.time))
     labels = np.asarray(window)
     if labels.shape not in (shape, shape[1:]) or not np.issubdtype(labels.dtype, np.integer):
-        raise InputError(
-            "window",
-            f"{labels.dtype} of shape {list(labels.shape)}",
-            f"whole numbers, one per sample [{shape[1]}] or per lane and sample {list(shape)}",
-        )
-    numbers = {key: np.asarray(batch[key], dtype=np.float64) for key in _NUMBERS}
+        expected = f"whole numbers, one per sample [{shape[1]}] or per lane and sample {list(shape)}"
+        raise InputError("window", f"{labels.dtype} of shape {list(labels.shape)}", expected)
+    fields = {name: batch[name] for name in RECORD}
+    return run_of(fields, batch.setpoint, np.broadcast_to(labels.astype(np.int32), shape))
+
+
+def run_of(fields: Mapping[str, Any], setpoint, window) -> Run:
+    """A run, or many with the lane axis first, from the fields `RECORD` of `Trajectory`."""
     return Run(
-        **numbers,
-        setpoint=np.asarray(batch.setpoint, dtype=np.float64),
-        window=np.broadcast_to(labels.astype(np.int32), shape),
-        optimal=np.asarray(batch["status"]) == OPTIMAL,
-        fallback=np.asarray(batch["fallback"]) != 0,
-        left_out=np.asarray(batch["quality"]) != GOOD,
-        off=np.asarray(batch["off"]) != 0,
+        **{key: np.asarray(fields[key], dtype=np.float64) for key in _NUMBERS},
+        setpoint=np.asarray(setpoint, dtype=np.float64),
+        window=window,
+        optimal=np.asarray(fields["status"]) == OPTIMAL,
+        fallback=np.asarray(fields["fallback"]) != 0,
+        left_out=np.asarray(fields["quality"]) != GOOD,
+        off=np.asarray(fields["off"]) != 0,
     )
 
 
@@ -319,10 +302,9 @@ def run_kpis(
         "switched_off": run.off.sum(axis=0),
         "finite": finite,
     }
-    numbers = {name: jnp.asarray(value, dtype=jnp.float64) for name, value in figures.items()}
     return {
-        name: value if name in ALWAYS else jnp.where(finite, value, jnp.nan)
-        for name, value in numbers.items()
+        name: jnp.where(finite | (name in ALWAYS), jnp.asarray(value, dtype=jnp.float64), jnp.nan)
+        for name, value in figures.items()
     }
 
 
@@ -353,11 +335,9 @@ def batch_kpis(batch: TrajectoryBatch, tunings: Tuning, window, *, tolerance=Non
     channels = channels_of(batch)
     runs = runs_of(batch, window)
     lanes, cvs, mvs = len(batch), len(batch.cv_names), len(batch.mv_names)
+    sizes = {name: (cvs if name in PER_CV else mvs,) for name in Tuned._fields}
     each = Tuned(
-        *(
-            _per_lane(f"tunings.{name}", getattr(tunings, name), lanes, (cvs if name in PER_CV else mvs,))
-            for name in Tuned._fields
-        )
+        *(_per_lane(f"tunings.{name}", getattr(tunings, name), lanes, size) for name, size in sizes.items())
     )
     allowed = each.deadzone
     if tolerance is not None:
@@ -372,17 +352,9 @@ def _per_lane(field: str, given, lanes: int, size: tuple[int, ...]) -> Any:
     """One value of the given size for each lane, from one per lane or one for all."""
     value = np.asarray(given)
     if value.shape not in (size, (lanes, *size)):
-        raise InputError(
-            field,
-            f"shape {list(value.shape)}",
-            f"shape {[lanes, *size]}, one per lane, or {list(size)} for all",
-        )
+        expected = f"shape {[lanes, *size]}, one per lane, or {list(size)} for all"
+        raise InputError(field, f"shape {list(value.shape)}", expected)
     return np.broadcast_to(value, (lanes, *size))
 
 
-@functools.partial(jax.jit, static_argnames="channels")
-def _batched(runs: Run, tunings: Tuned, tolerance, dt, channels: Channels) -> dict[str, Array]:
-    """`run_kpis` of every lane."""
-    return jax.vmap(lambda run, tuning, near: run_kpis(run, tuning, near, dt, channels))(
-        runs, tunings, tolerance
-    )
+_batched = jax.jit(jax.vmap(run_kpis, in_axes=(0, 0, 0, None, None)), static_argnames="channels")

@@ -27,9 +27,10 @@ def _(mo):
 
     # Ratios to the preset's own value, so that one slider serves values of any size.
     RATIOS = [2.0**k for k in range(-5, 6)]
+    SLIDER = {"show_value": True, "debounce": True, "full_width": True}
     _request = mo.app_meta().request
     given_store = str(_request.meta.get("store", "")) if _request is not None else ""
-    return InputError, RATIOS, draw, explore, given_store, html, presets
+    return InputError, RATIOS, SLIDER, draw, explore, given_store, html, presets
 
 
 @app.cell
@@ -43,8 +44,10 @@ def _(mo):
 def _(mo):
     import contextlib
     import queue
+    import time
 
-    from jaxmpc.programs.compilation import compiled_since, told
+    from jaxmpc.programs.clock import Clock
+    from jaxmpc.programs.compilation import told
 
     @contextlib.contextmanager
     def compilation_shown():
@@ -65,7 +68,7 @@ def _(mo):
             thread.join()
             mo.output.clear()
 
-    return compilation_shown, compiled_since
+    return Clock, compilation_shown, time
 
 
 @app.cell
@@ -92,62 +95,49 @@ def _(explore, mo, presets):
 
 
 @app.cell
-def _(RATIOS, mo, preset, presets):
+def _(RATIOS, SLIDER, mo, preset, presets):
     _fields = presets.TUNINGS[preset.value]
 
     def _slider(label, value, unit, steps=None):
         steps = steps or [float(f"{ratio * value:.4g}") for ratio in RATIOS]
-        return mo.ui.slider(
-            steps=steps,
-            value=value,
-            label=f"{label} [{unit}]",
-            show_value=True,
-            debounce=True,
-            full_width=True,
-        )
+        return mo.ui.slider(steps=steps, value=value, label=f"{label} [{unit}]", **SLIDER)
 
-    choke_weight = _slider("choke move weight", _fields["move_weight"]["choke"], "1/%²")
-    oil_weight = _slider("oil weight", _fields["cv_weight"]["oil_rate"], "1/(m³/h)²")
-    gas_weight = _slider("gas weight", _fields["cv_weight"]["gas_rate"], "1/(m³/h)²")
-    oil_deadzone = _slider(
-        "oil deadzone", _fields["deadzone"]["oil_rate"], "m³/h", [0.5 * k for k in range(41)]
+    tuning = mo.ui.dictionary(
+        {
+            "choke_weight": _slider("choke move weight", _fields["move_weight"]["choke"], "1/%²"),
+            "oil_deadzone": _slider(
+                "oil deadzone", _fields["deadzone"]["oil_rate"], "m³/h", [0.5 * k for k in range(41)]
+            ),
+            "gas_deadzone": _slider(
+                "gas deadzone", _fields["deadzone"]["gas_rate"], "m³/h", [100.0 * k for k in range(31)]
+            ),
+            "oil_weight": _slider("oil weight", _fields["cv_weight"]["oil_rate"], "1/(m³/h)²"),
+            "gas_weight": _slider("gas weight", _fields["cv_weight"]["gas_rate"], "1/(m³/h)²"),
+        }
     )
-    gas_deadzone = _slider(
-        "gas deadzone", _fields["deadzone"]["gas_rate"], "m³/h", [100.0 * k for k in range(31)]
-    )
-    tuning_panel = mo.vstack([choke_weight, oil_deadzone, gas_deadzone, oil_weight, gas_weight], gap=0.4)
-    return choke_weight, gas_deadzone, gas_weight, oil_deadzone, oil_weight, tuning_panel
+    tuning_panel = mo.vstack(list(tuning.elements.values()), gap=0.4)
+    return tuning, tuning_panel
 
 
 @app.cell
-def _(explore, mo):
+def _(SLIDER, explore, mo):
     def _slider(start, stop, step, value, label):
-        return mo.ui.slider(
-            start, stop, step, value=value, label=label, show_value=True, debounce=True, full_width=True
-        )
+        return mo.ui.slider(start, stop, step, value=value, label=label, **SLIDER)
 
-    oil_setpoint = _slider(80, 240, 1, 152, "oil setpoint [m³/h]")
-    gas_setpoint = _slider(5000, 17000, 20, 9640, "gas setpoint [m³/h]")
-    pressure = _slider(-4, 4, 0.25, 0, "reservoir pressure change [bar]")
-    pressure_time = _slider(0, 1790, 10, 900, "from [s]")
-    model_choke = _slider(6, 96, 2, 50, "model: choke [%]")
-    model_lift = _slider(2500, 9500, 250, 7500, "model: lift [m³/h]")
-    setpoint_panel = mo.vstack(
-        [mo.md(f"**Setpoints** from {explore.STEP_TIME:g} s"), oil_setpoint, gas_setpoint], gap=0.4
+    scenario = mo.ui.dictionary(
+        {
+            "oil_setpoint": _slider(80, 240, 1, 152, "oil setpoint [m³/h]"),
+            "gas_setpoint": _slider(5000, 17000, 20, 9640, "gas setpoint [m³/h]"),
+            "pressure": _slider(-4, 4, 0.25, 0, "reservoir pressure change [bar]"),
+            "pressure_time": _slider(0, 1790, 10, 900, "from [s]"),
+            "model_choke": _slider(6, 96, 2, 50, "model: choke [%]"),
+            "model_lift": _slider(2500, 9500, 250, 7500, "model: lift [m³/h]"),
+        }
     )
-    model_panel = mo.accordion(
-        {"Disturbance and model": mo.vstack([pressure, pressure_time, model_choke, model_lift], gap=0.4)}
-    )
-    return (
-        gas_setpoint,
-        model_choke,
-        model_lift,
-        model_panel,
-        oil_setpoint,
-        pressure,
-        pressure_time,
-        setpoint_panel,
-    )
+    _sliders = list(scenario.elements.values())
+    setpoint_panel = mo.vstack([mo.md(f"**Setpoints** from {explore.STEP_TIME:g} s"), *_sliders[:2]], gap=0.4)
+    model_panel = mo.accordion({"Disturbance and model": mo.vstack(_sliders[2:], gap=0.4)})
+    return model_panel, scenario, setpoint_panel
 
 
 @app.cell
@@ -162,27 +152,19 @@ def _(choices_panel, length, mo, model_panel, page, setpoint_panel, tuning_panel
 
 @app.cell
 def _(
+    Clock,
     InputError,
     blocking,
-    choke_weight,
     compilation_shown,
-    compiled_since,
     controller,
     explore,
-    gas_deadzone,
-    gas_setpoint,
-    gas_weight,
     length,
     mo,
-    model_choke,
-    model_lift,
-    oil_deadzone,
-    oil_setpoint,
-    oil_weight,
     preset,
-    pressure,
-    pressure_time,
+    scenario,
     soft,
+    time,
+    tuning,
 ):
     run, refused = None, None
     try:
@@ -191,28 +173,19 @@ def _(
             preset=preset.value,
             soft=soft.value,
             blocking=blocking.value,
-            choke_weight=choke_weight.value,
-            gas_weight=gas_weight.value,
-            oil_weight=oil_weight.value,
-            gas_deadzone=gas_deadzone.value,
-            oil_deadzone=oil_deadzone.value,
-            model_choke=model_choke.value,
-            model_lift=model_lift.value,
-            gas_setpoint=gas_setpoint.value,
-            oil_setpoint=oil_setpoint.value,
-            pressure=pressure.value,
-            pressure_time=pressure_time.value,
             whole=length.value,
+            **tuning.value,
+            **scenario.value,
         )
         if length.value:
             with (
                 compilation_shown(),
                 mo.status.progress_bar(total=7800, title="22 h", show_eta=True, remove_on_exit=True) as _bar,
             ):
-                _done, _compiled = [0], compiled_since()
+                _done, _clock = [0], Clock()
 
                 def _report(done, total):
-                    _bar.start_time += _compiled()
+                    _bar.start_time = time.time() - _clock.seconds
                     _bar.update(increment=done - _done[0])
                     _done[0] = done
 
@@ -226,11 +199,9 @@ def _(
 
 
 @app.cell
-def _(length, mo):
+def _(SLIDER, length, mo):
     _last = 77990 if length.value else 1790
-    plan_time = mo.ui.slider(
-        0, _last, 10, value=300, label="plan made at [s]", show_value=True, debounce=True, full_width=True
-    )
+    plan_time = mo.ui.slider(0, _last, 10, value=300, label="plan made at [s]", **SLIDER)
     return (plan_time,)
 
 
@@ -248,16 +219,12 @@ def _(draw, explore, get_pinned, html, mo, page, pin, refused, run, unpin):
             return refused
         pinned = get_pinned()
         figure = draw.tracking(run.data, pinned=None if pinned is None else pinned.data)
-        now = explore.shown_figures(run)
-        before = explore.shown_figures(pinned) if pinned is not None else [(*row[:2], None) for row in now]
-        rows = []
-        for (words, unit, value), (_, _, old) in zip(now, before, strict=True):
-            number, shown = explore.written(value, unit)
-            other = [explore.written(old, unit)] if old is not None else []
-            rows.append(
-                [words, number, *(" ".join(pair) if pair[1] != shown else pair[0] for pair in other), shown]
-            )
-        head = ["", "now", *(["pinned"] if pinned is not None else []), ""]
+        rows, runs = [], [run] if pinned is None else [run, pinned]
+        for figures in zip(*map(explore.shown_figures, runs), strict=True):
+            (now, shown), *before = (explore.written(value, unit) for _, unit, value in figures)
+            old = (number if unit == shown else f"{number} {unit}" for number, unit in before)
+            rows.append([figures[0][0], now, *old, shown])
+        head = ["", *("now", "pinned")[: len(runs)], ""]
         side = [
             mo.Html(
                 '<div id="key-figures" style="font-size:12px;line-height:1.3;white-space:nowrap">'

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from figures.closed_loop import RUN, of_trajectory
 from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
 from jaxmpc.loop.reference import Reference
@@ -30,11 +31,9 @@ from studies.definition import presets, references
 from studies.definition.models import identify_models
 from studies.definition.presets import CHOKE, GAS, OIL
 from studies.kpi.sweep import KPIS, RECORD, batch_kpis
-from studies.thesis.plans import StoredPlan, plan_at
 
 Progress = Callable[[int, int], None]
 
-RUN = "run"  # name of the one controller in `ExploreRun.data`
 CONTROLLERS = {  # kind of the controller and of the choke
     "continuous": ("continuous", "continuous"),
     "rounded": ("continuous", "step"),
@@ -72,55 +71,32 @@ def _in(unit: str, default: float | None) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What a run is made of; None takes the value of the preset.
+    """What a run is made of; None takes the value of the preset."""
 
-    Attributes:
-        controller: a key of `CONTROLLERS`; ``rounded`` is continuous MPC on the step choke.
-        preset: a key of `studies.definition.presets.TUNINGS`.
-        soft: False turns Soft MPC off: the weight of the deviation becomes Q + S, as in a sweep.
-        blocking: one of `BLOCKING`.
-        choke_weight: move weight of the choke [1/%^2].
-        gas_weight: weight of the deviation of the gas rate [1/(m3/h)^2].
-        oil_weight: weight of the deviation of the oil rate [1/(m3/h)^2].
-        gas_deadzone: of Soft MPC [m3/h].
-        oil_deadzone: of Soft MPC [m3/h].
-        model_choke: choke at the working point of the model [%].
-        model_lift: gas lift there [m3/h].
-        gas_setpoint: of a short run, from `STEP_TIME` on [m3/h].
-        oil_setpoint: of a short run, from `STEP_TIME` on [m3/h].
-        pressure: change of the reservoir pressure, the disturbance [bar].
-        pressure_time: from when on [s].
-        whole: the whole reference of the thesis (22 h) instead of a short run.
-    """
-
-    controller: str = "mixed-integer"
-    preset: str = "thesis"
-    soft: bool = True
-    blocking: str = "moves"
-    choke_weight: float | None = _in("1/%^2", None)
-    gas_weight: float | None = _in("1/(m3/h)^2", None)
+    controller: str = "mixed-integer"  # a key of `CONTROLLERS`; "rounded" is continuous MPC on the step choke
+    preset: str = "thesis"  # a key of `studies.definition.presets.TUNINGS`
+    soft: bool = True  # False turns Soft MPC off: the weight of the deviation becomes Q + S, as in a sweep
+    blocking: str = "moves"  # one of `BLOCKING`
+    choke_weight: float | None = _in("1/%^2", None)  # of its moves
+    gas_weight: float | None = _in("1/(m3/h)^2", None)  # of the deviation
     oil_weight: float | None = _in("1/(m3/h)^2", None)
-    gas_deadzone: float | None = _in("m3/h", None)
+    gas_deadzone: float | None = _in("m3/h", None)  # half width
     oil_deadzone: float | None = _in("m3/h", None)
-    model_choke: float = _in("%", 50.0)
+    model_choke: float = _in("%", 50.0)  # working point of the model
     model_lift: float = _in("m3/h", 7500.0)
-    gas_setpoint: float = _in("m3/h", 9640.0)
+    gas_setpoint: float = _in("m3/h", 9640.0)  # of a short run, from `STEP_TIME` on
     oil_setpoint: float = _in("m3/h", 152.0)
-    pressure: float = _in("bar", 0.0)
-    pressure_time: float = _in("s", 900.0)
-    whole: bool = False
+    pressure: float = _in("bar", 0.0)  # change of the reservoir pressure, the disturbance
+    pressure_time: float = _in("s", 900.0)  # from when on
+    whole: bool = False  # the whole reference of the thesis (22 h) instead of a short run
 
     def __post_init__(self):
         for field, known in CHOICES.items():
             if getattr(self, field) not in known:
                 raise InputError(field, getattr(self, field), f"one of {', '.join(known)}")
         if self.blocking == "none" and self.controller == "mixed-integer":
-            raise InputError(
-                "blocking",
-                "none",
-                "blocks for whole moves",
-                "Without blocks a step with whole moves takes seconds; choose moves or inputs, or another controller",
-            )
+            hint = "Without blocks a step with whole moves takes seconds; choose moves or inputs, or another controller"
+            raise InputError("blocking", "none", "blocks for whole moves", hint)
         for field, unit in (("pressure", "bar"), ("pressure_time", "s")):
             if not np.isfinite(getattr(self, field)):
                 raise InputError(field, getattr(self, field), f"a number [{unit}]")
@@ -158,73 +134,44 @@ class Settings:
     def offsets(self) -> np.ndarray:
         """Change of the reservoir pressure, ``"sample"`` [bar]."""
         dt = presets.SAMPLING_INTERVAL
-        return np.where(
-            np.arange(self.reference.samples(dt)) * dt >= self.pressure_time - 1e-9 * dt, self.pressure, 0.0
-        )
+        times = np.arange(self.reference.samples(dt)) * dt
+        return np.where(times >= self.pressure_time - 1e-9 * dt, self.pressure, 0.0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ExploreRun:
-    """A finished run.
-
-    Attributes:
-        settings: that it was made with.
-        trajectory: every sample, with its plans.
-        kpis: every key figure of `studies.kpi.sweep` by name; ``name.channel`` where it is one per CV or MV.
-        model: prediction model of the controller.
-        tuning: of the controller.
-        structure: of the controller.
-        seconds: time that it took, key figures included [s].
-    """
+    """A finished run."""
 
     settings: Settings
-    trajectory: Trajectory
-    kpis: dict[str, float]
+    trajectory: Trajectory  # every sample, with its plans
+    kpis: dict[
+        str, float
+    ]  # every key figure of `studies.kpi.sweep`; ``name.channel`` where it is one per CV or MV
     model: StepResponseModel
     tuning: Tuning
     structure: Structure
-    seconds: float
+    seconds: float  # that it took, key figures included
 
     @functools.cached_property
     def data(self) -> xr.Dataset:
         """The run as `studies.store.reading.open_results` would give it, with one controller `RUN`."""
         t, structure, settings = self.trajectory, self.structure, self.settings
         kind, actuator = CONTROLLERS[settings.controller]
-        window = settings.reference.window(t.dt, t.samples)
-        variables: dict[str, Any] = {
-            "measurement": (("controller", "time", "cv"), t.cv[None]),
-            "demand": (("controller", "time", "mv"), t.mv_demand[None]),
-            "position": (("controller", "time", "mv"), t.mv[None]),
-            "move": (("controller", "time", "mv"), t.move[None]),
-            "bias": (("controller", "time", "cv"), t.bias[None]),
+        known: dict[str, Any] = {
             "plan": (("controller", "time", "block", "mv"), np.asarray(t.plan)[None]),
-            "setpoint": (("time", "cv"), t.setpoint),
-            "window": ("time", window),
+            "window": ("time", settings.reference.window(t.dt, t.samples)),
             "disturbance": ("time", settings.offsets[: t.samples]),
             "model_coefficient": (("cv", "mv", "lag"), np.asarray(self.model.coefficients)),
             "block_length": (("controller", "block"), np.array([structure.blocks])),
             "prediction_horizon": ("controller", [structure.prediction_horizon]),
             "complete": ("controller", [1]),
+            "blocking": ("controller", [structure.blocking]),
         }
-        for name, value in {"kind": kind, "actuator": actuator, "blocking": structure.blocking}.items():
-            variables[name] = ("controller", [value])
         for name in ("deadzone", "soft_quadratic", "soft_linear"):
-            variables[f"tuning_{name}"] = (("controller", "cv"), np.asarray(getattr(self.tuning, name))[None])
-        coords: dict[str, Any] = {"controller": [RUN], "time": t.time}
-        coords |= {"cv": list(t.cv_names), "mv": list(t.mv_names)}
-        coords |= {"cv_unit": ("cv", list(t.cv_units)), "mv_unit": ("mv", list(t.mv_units))}
+            known[f"tuning_{name}"] = (("controller", "cv"), np.asarray(getattr(self.tuning, name))[None])
         definition = {"controllers": [{"name": RUN, "kind": kind, "actuator": actuator, "schedule": False}]}
-        return xr.Dataset(variables, coords, {"dt": t.dt, "definition": json.dumps(definition)})
-
-    def plan_at(self, sample: int) -> StoredPlan:
-        """The plan made at a sample, with the prediction that it was made on.
-
-        Raises:
-            InputError: for a sample outside the run.
-        """
-        if not 0 <= sample < self.trajectory.samples:
-            raise InputError("sample", sample, f"a sample of the run, 0 to {self.trajectory.samples - 1}")
-        return plan_at(self.data, RUN, float(self.trajectory.time[sample]))
+        run = of_trajectory(t, self.tuning.deadzone, kind, actuator)
+        return run.assign(known).assign_attrs(definition=json.dumps(definition))
 
 
 @functools.lru_cache(maxsize=64)
@@ -235,11 +182,7 @@ def model_at(choke: float, lift: float) -> StepResponseModel:
 
 
 def run(settings: Settings, progress: Progress | None = None) -> ExploreRun:
-    """Close the loop.
-
-    Args:
-        settings: of the run.
-        progress: called with ``(done, total)`` samples.
+    """Close the loop; `progress` is called with ``(done, total)`` samples.
 
     Raises:
         InputError: naming the field, for settings that no controller or well can have; before anything runs.
@@ -262,25 +205,11 @@ def run(settings: Settings, progress: Progress | None = None) -> ExploreRun:
 
 
 def key_figures(trajectory: Trajectory, tuning: Tuning, window: np.ndarray) -> dict[str, float]:
-    """Every key figure of a run by name, ``name.channel`` where it is one per CV or MV.
-
-    Args:
-        trajectory: of the well.
-        tuning: of its controller.
-        window: labels of the setpoint windows, ``"sample"``.
-    """
+    """Every key figure of a run by name, ``name.channel`` where it is one per CV or MV; window labels ``"sample"``."""
     t = trajectory
-    batch = TrajectoryBatch(
-        lanes=np.zeros(1, dtype=int),
-        time=t.time,
-        setpoint=t.setpoint[None],
-        fields={name: np.asarray(getattr(t, name))[None] for name in RECORDABLE if name in RECORD},
-        cv_names=t.cv_names,
-        mv_names=t.mv_names,
-        cv_units=t.cv_units,
-        mv_units=t.mv_units,
-        dt=t.dt,
-    )
+    recorded = {name: np.asarray(getattr(t, name))[None] for name in RECORDABLE if name in RECORD}
+    same = {name: getattr(t, name) for name in ("time", "cv_names", "mv_names", "cv_units", "mv_units", "dt")}
+    batch = TrajectoryBatch(np.zeros(1, dtype=int), setpoint=t.setpoint[None], fields=recorded, **same)
     values = batch_kpis(batch, tuning, window)
     out: dict[str, float] = {}
     for item in KPIS:

@@ -1,16 +1,14 @@
 """Computing the scenarios of a sweep study: one chunk in, arrays out. `run_chunk` is all that any executor calls.
 
 A chunk is a pure function of the prepared study and its number; nothing is read or written. All chunks of a group have one
-shape and share one compiled program: the last one is filled up with copies of its last scenario.
+shape: the last one is filled up with copies of its last scenario.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import datetime
 import os
 import platform
-import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -24,17 +22,17 @@ from jaxmpc.files import strict_json
 from jaxmpc.loop.simulate import simulate_batches
 from jaxmpc.loop.trajectory import TrajectoryBatch
 from jaxmpc.model.step_response import StepResponseModel
-from jaxmpc.problem.layout import Size
 from jaxmpc.problem.tuning import stack_tunings
 from jaxmpc.process.plant import WellPlant
 from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS
+from jaxmpc.programs.clock import Clock
 from jaxmpc.programs.lanes import Lanes
 from studies.definition.models import Point, identify_models
 from studies.definition.scenarios import Scenario, Study
 from studies.kpi.objectives import THESIS_DEADZONE
 from studies.kpi.sweep import KPIS, RECORD, batch_kpis
-from studies.store.fingerprint import versions
-from studies.store.layout import FLAG, StoreLayout, Variable
+from studies.store.fingerprint import made_now
+from studies.store.layout import FLAG, StoreLayout, Variable, process_axes
 from studies.store.trajectories import swept
 
 # A CV counts as settled within the deadzone of the thesis, whatever its own: otherwise a wide deadzone settles at once.
@@ -51,17 +49,11 @@ class PreparedStudy:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ChunkResult:
-    """What a chunk leaves behind.
+    """What a chunk leaves behind."""
 
-    Attributes:
-        index: of the chunk.
-        fields: every stored variable, ``"lane ..."``, real lanes only.
-        facts: JSON-like: ``wall_time`` [s] and where it was computed.
-    """
-
-    index: int
-    fields: dict[str, np.ndarray]
-    facts: dict[str, Any]
+    index: int  # of the chunk
+    fields: dict[str, np.ndarray]  # every stored variable, ``"lane ..."``, real lanes only
+    facts: dict[str, Any]  # JSON-like: ``wall_time`` [s], compilation left out, and where it was computed
 
 
 def prepare_study(study: Study, progress: Callable[[int, int], None] | None = None) -> PreparedStudy:
@@ -70,26 +62,11 @@ def prepare_study(study: Study, progress: Callable[[int, int], None] | None = No
     return PreparedStudy(study, {point: jax.tree.map(np.asarray, model) for point, model in models.items()})
 
 
-_program_before: list[tuple] = []  # the one of the last chunk in this process
-
-
 def run_chunk(prepared: PreparedStudy, index: int) -> ChunkResult:
-    """Run the closed loops of a chunk.
-
-    Args:
-        prepared: from `prepare_study`.
-        index: of the chunk.
-    """
+    """Run the closed loops of a chunk."""
     study = prepared.study
     chunk = study.chunks[index]
     group, lanes = study.groups[chunk.group], study.lanes(chunk.group)
-    size = Size.of(group.structure, max(model.samples for model in prepared.models.values()))
-    own = group.kind, group.actuator, size, group.samples, group.has_limits, group.whole_steps
-    program = *own, group.switching, lanes
-    if _program_before != [program]:
-        if _program_before:
-            jax.clear_caches()  # those of a dozen groups do not fit side by side
-        _program_before[:] = [program]
     fields, facts = run_scenarios(
         [study.scenario(int(k)) for k in chunk.scenarios],
         prepared.models,
@@ -118,50 +95,42 @@ def run_scenarios(
 
     Args:
         scenarios: 1 to `lanes` of them.
-        models: by working point.
         lanes: of the compiled program; it is filled up with copies of the last scenario.
         points: length of the stored time axis; shorter runs end in NaN (-1 for codes).
         every: samples from one stored point to the next.
         trajectories: fields of `Trajectory` to keep.
-        shared_model: whether all scenarios of the group have one model.
         plant_fields: parameters of the well that may differ from lane to lane.
-
-    Returns:
-        ``(fields, facts)`` as in `ChunkResult`.
     """
-    begin = time.perf_counter()
+    clock = Clock()
     filled = [*scenarios, *([scenarios[-1]] * (lanes - len(scenarios)))]
     first = filled[0]
     tunings = [s.tuning for s in filled]
     model = [models[first.model_point]] if shared_model else [models[s.model_point] for s in filled]
     controllers = Controllers(first.structure, tunings, model, count=lanes)
     references = [s.reference for s in filled]
-    disturbed = any(s.disturbance is not None for s in filled)
-    noisy = any(s.noise is not None for s in filled)
-    failing = any(s.faults is not None for s in filled)
     seeds: Any = np.array([s.seed for s in filled])
-    still, quiet, sound = (
-        np.zeros(first.samples),
-        np.zeros(len(CV_NAMES)),
-        np.zeros((first.samples, len(CV_NAMES))),
-    )
+    cvs = len(CV_NAMES)
+
+    def stacked(name: str, *shape: int) -> np.ndarray | None:
+        given = [getattr(s, name) for s in filled]
+        none = all(value is None for value in given)
+        return None if none else np.stack([np.zeros(shape) if value is None else value for value in given])
+
     batches = simulate_batches(
         controllers,
         _plants(filled, plant_fields),
         references,
         samples=first.samples,
-        disturbance=np.stack([still if s.disturbance is None else s.disturbance for s in filled])
-        if disturbed
-        else None,
-        noise=np.stack([quiet if s.noise is None else s.noise for s in filled]) if noisy else None,
+        disturbance=stacked("disturbance", first.samples),
+        noise=stacked("noise", cvs),
         seed=seeds,
-        faults=np.stack([sound if s.faults is None else s.faults for s in filled]) if failing else None,
+        faults=stacked("faults", first.samples, cvs),
         position_feedback=np.array([s.position_feedback for s in filled]),
         record=tuple(dict.fromkeys((*RECORD, *(f for f in trajectories if f != "setpoint")))),
         lanes_at_once=lanes,
     )
     (batch,) = batches
-    simulated = time.perf_counter()
+    simulated = clock.seconds
     windows = np.stack([s.reference.window(s.structure.dt, s.samples) for s in filled])
     figures = batch_kpis(batch, stack_tunings(tunings), windows, tolerance=np.array(SETTLED))
     fields = {name: values[: len(scenarios)] for name, values in figures.items()}
@@ -169,8 +138,8 @@ def run_scenarios(
     for field in trajectories:
         fields[swept(field).name] = _kept(batch, field, len(scenarios), every, points)
     facts = {
-        "wall_time": time.perf_counter() - begin,
-        "simulation_time": simulated - begin,
+        "wall_time": clock.seconds,
+        "simulation_time": simulated,
         "lanes": lanes,
         "scenarios": len(scenarios),
         "device": jax.devices()[0].device_kind,
@@ -211,7 +180,6 @@ def study_layout(study: Study, command: str | None = None) -> StoreLayout:
     """What the store has to know of a study.
 
     Args:
-        study: the study.
         command: words after ``jaxmpc study run`` that give it: a shipped name or a file, and ``--quick``.
     """
     noise = "the column seed" if any(c.key == "seed" for c in study.columns) else study.scenario(0).seed
@@ -224,23 +192,18 @@ def study_layout(study: Study, command: str | None = None) -> StoreLayout:
         scenario_hashes=study.scenario_hashes,
         columns=study.columns,
         variables=stored_variables(study.definition.store.trajectories),
-        coords={
-            "time": (stored_times(study), "s", "time"),
-            "cv": (list(CV_NAMES), "", "controlled variable"),
-            "mv": (list(MV_NAMES), "", "manipulated variable"),
-            "cv_unit": (list(CV_UNITS), "", "unit of the CV"),
-            "mv_unit": (list(MV_UNITS), "", "unit of the MV"),
-        },
+        coords=process_axes(
+            stored_times(study), {"cv": CV_NAMES, "mv": MV_NAMES}, {"cv": CV_UNITS, "mv": MV_UNITS}
+        ),
         provenance={
             "definition": strict_json(study.definition.body),
             **({} if command is None else {"definition_file": command}),
             "folder": str(study.definition.folder),
             "quick": study.definition.is_cut,
             "seeds": {"sampling": study.definition.sampling.seed, "noise": noise},
-            "versions": versions(),
             "settled": dict(zip(CV_NAMES, SETTLED, strict=True)),
             "work": dataclasses.asdict(study.work),
-            "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            **made_now(),
         },
     )
 

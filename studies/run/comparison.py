@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import datetime
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -29,11 +27,12 @@ from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.problem.tuning import Tuning
-from jaxmpc.programs.compilation import compiled_since
+from jaxmpc.programs.clock import Clock
 from studies.definition.comparison import ComparisonDefinition, ControllerDefinition
+from studies.run.progress import looks
 from studies.store.files import FORMAT, RESULTS, open_manifest, survey
-from studies.store.fingerprint import content_hash, source_hash, versions
-from studies.store.layout import Column, StoreLayout
+from studies.store.fingerprint import content_hash, made_now, source_hash
+from studies.store.layout import Column, StoreLayout, process_axes
 from studies.store.reading import open_results, provenance
 from studies.store.trajectories import PLAN, RUN_VARIABLES, run_fields
 from studies.store.writing import Store
@@ -57,19 +56,12 @@ def run_comparison(
     """Run what is missing of a comparison.
 
     Args:
-        definition: checked with `ComparisonDefinition.check`.
         folder: of the study, writable and locked by the caller.
-        model: prediction model of every controller.
         make_plant: the plant with a given actuator, in its initial state.
         plant_facts: JSON-like; identifies the plant, part of every hash.
         extra: computes further variables of the results (sweep, steady-state map); called for a new store.
         others: stores of other studies, for a new store to take equal runs from.
         schedule: models of the controllers with `ControllerDefinition.schedule`; None if there are none.
-        progress: whether to show a bar with rate and time left.
-        say: receives one line per event.
-
-    Returns:
-        The folder.
     """
     code = {package: source_hash(package) for package in ("jaxmpc", "identify")}
     inputs = {
@@ -111,12 +103,7 @@ def run_missing(
     Args:
         folder: of the study; its store is locked by the caller.
         layout: from `results_layout`.
-        run: closes the loop of a controller, by its number.
-        say: receives a line per controller and event.
         others: stores of other studies, for a new store to take equal runs from.
-
-    Returns:
-        The folder.
     """
     with Store.begin(folder / RESULTS, layout, say, others=others, lock=False) as store:
         missing = store.pending()
@@ -134,12 +121,7 @@ def run_missing(
 
 
 def is_current(definition: ComparisonDefinition, folder: Path) -> bool:
-    """Whether every run of a study is stored undamaged, made from this definition by today's code.
-
-    Args:
-        definition: of the study.
-        folder: its results.
-    """
+    """Whether every run of a study is stored undamaged, made from this definition by today's code."""
     try:
         store, manifest = open_manifest(folder / RESULTS)
         if len(survey(store, manifest["contents"], deep=True).records) < len(definition.controllers):
@@ -166,16 +148,7 @@ def run_controller(
     progress: bool = True,
     schedule: ModelSchedule | None = None,
 ) -> Trajectory:
-    """One closed loop of a comparison.
-
-    Args:
-        definition: of the controller.
-        comparison: gives the reference and the disturbance.
-        model: prediction model.
-        make_plant: the plant with a given actuator.
-        progress: whether to show a bar with rate and time left.
-        schedule: prediction models of a controller with a schedule.
-    """
+    """One closed loop of a comparison."""
     structure = definition.structure()
 
     def controller(tuning: Tuning) -> Controller:
@@ -202,15 +175,13 @@ def run_controller(
 @contextlib.contextmanager
 def progress_bar(label: str, show: bool) -> Iterator[Callable[[int, int], None]]:
     """A progress callback ``(done, total)`` that shows samples, rate and time left, compilation not counted."""
-    often = 0.5 if sys.stderr.isatty() else 10.0  # s; a log file needs no more
-    with tqdm(desc=label, unit=" samples", disable=not show, dynamic_ncols=True, mininterval=often) as bar:
-        compiled = compiled_since()
+    with tqdm(desc=label, unit=" samples", **looks(show)) as bar:
+        clock = Clock()
 
         def report(done: int, total: int) -> None:
             if show:
-                seconds = compiled()
-                bar.start_t += seconds
-                bar.last_print_t += seconds
+                bar.start_t = time.time() - clock.seconds
+                bar.last_print_t = max(bar.last_print_t, bar.start_t)
             bar.total = total
             bar.update(done - bar.n)
 
@@ -243,25 +214,14 @@ def results_layout(
 
     Args:
         controllers: name and label of each.
-        hashes: content hash of each controller's inputs.
-        structure: names, units and dt of all of them.
-        samples: of the runs.
         blocks: of the controller that has most.
         shared: gives the variables without a trajectory: setpoints, tuning, model, sweep.
         provenance: JSON-like facts, one attribute each, with ``study`` and ``title``.
-        study_hash: hash of everything that the results depend on.
     """
-    s, facts = (
-        structure,
-        provenance
-        | {
-            "versions": versions(),
-            "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        },
-    )
+    s = structure
     return StoreLayout(
-        name=facts["study"],
-        title=facts["title"],
+        name=provenance["study"],
+        title=provenance["title"],
         study_hash=study_hash,
         chunk_size=1,
         chunk_scenarios=tuple(np.arange(i, i + 1) for i in range(len(hashes))),
@@ -270,14 +230,12 @@ def results_layout(
             Column("label", "controller and actuator", "", np.array(list(controllers.values()), object)),
         ),
         variables=RUN_VARIABLES,
-        coords={
-            "time": (s.dt * np.arange(samples), "s", "time"),
-            "cv": (s.cv_names, "", "controlled variable"),
-            "mv": (s.mv_names, "", "manipulated variable"),
-            "cv_unit": (s.cv_units, "", "unit of the CV"),
-            "mv_unit": (s.mv_units, "", "unit of the MV"),
-        },
-        provenance={"dt": s.dt, **facts},
+        coords=process_axes(
+            s.dt * np.arange(samples),
+            {"cv": s.cv_names, "mv": s.mv_names},
+            {"cv": s.cv_units, "mv": s.mv_units},
+        ),
+        provenance={"dt": s.dt, **provenance, **made_now()},
         rows="controller",
         names=tuple(controllers),
         lengths={PLAN.dims[1]: blocks},
@@ -294,17 +252,7 @@ def comparison_layout(
     plant_facts: dict[str, Any],
     code: dict[str, str],
 ) -> StoreLayout:
-    """The store of a comparison: setpoints, tuning, model and provenance.
-
-    Args:
-        definition: of the study.
-        model: prediction model.
-        extra: gives further variables.
-        hashes: content hash of every controller's inputs.
-        study_hash: of everything.
-        plant_facts: identifies the plant.
-        code: hash of every package that computes results.
-    """
+    """The store of a comparison: setpoints, tuning, model and provenance."""
     first = definition.controllers[0].structure()
     reference = definition.reference.build()
     if model.cv_names != first.cv_names or model.mv_names != first.mv_names:

@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any
+from typing import Any, Self
 
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.programs.interrupts import held
@@ -40,6 +40,12 @@ class Executor:
 
     def __init__(self, prepared: PreparedStudy):
         self.prepared = prepared
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
 
     @property
     def width(self) -> int:

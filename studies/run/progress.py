@@ -10,33 +10,35 @@ from typing import Any
 
 from tqdm import tqdm
 
-from jaxmpc.programs.compilation import clock
+from jaxmpc.programs.clock import Clock
 from studies.definition.estimate import Pace, Work, readable
 
 LAYOUT = "{l_bar}{bar}| {n_fmt}/{total_fmt} scenarios [{elapsed}{postfix}]"
 
 
+def looks(show: bool) -> dict[str, Any]:
+    """What all bars have in common."""
+    often = 0.5 if sys.stderr.isatty() else 10.0  # s; a log file needs no more
+    return {"disable": not show, "dynamic_ncols": True, "mininterval": often}
+
+
 class Progress:
     """A bar that is told of every chunk."""
 
-    def __init__(self, bar: tqdm, pace: Pace):
+    def __init__(self, bar: tqdm, work: Work, done: Mapping[int, Mapping[str, Any]]):
         """Use `progress_bar`."""
-        self._bar, self._pace = bar, pace
-        self._begin, self._scenarios = clock(), 0
+        self._bar, self._clock, self._scenarios = bar, Clock(), 0
+        self._pace = Pace(work, done, lambda: self._clock.seconds)
 
     def add(self, chunk: int, facts: Mapping[str, Any], scenarios: int, more: str = "") -> None:
         """A chunk was computed.
 
         Args:
-            chunk: its number.
-            facts: of the chunk.
-            scenarios: how many it has.
             more: to be shown beside rate and time left.
         """
         self._pace.add(chunk, facts)
         self._scenarios += scenarios
-        passed = max(clock() - self._begin, 1e-9)
-        words = [f"{self._scenarios / passed:.3g} per second", more]
+        words = [f"{self._scenarios / max(self._clock.seconds, 1e-9):.3g} per second", more]
         left = self._pace.left
         if not math.isnan(left) and left > 0:
             words.insert(0, f"about {readable(left)} left")
@@ -48,25 +50,7 @@ class Progress:
 def progress_bar(
     name: str, total: int, stored: int, work: Work, done: Mapping[int, Mapping[str, Any]], show: bool
 ) -> Iterator[Progress]:
-    """Show a bar while chunks are computed.
-
-    Args:
-        name: of the study.
-        total: scenarios.
-        stored: scenarios that are stored already.
-        work: of the study.
-        done: facts of the chunks that are stored already.
-        show: whether to show it.
-    """
-    often = 0.5 if sys.stderr.isatty() else 10.0  # s; a log file needs no more
-    with tqdm(
-        desc=name,
-        total=total,
-        initial=stored,
-        bar_format=LAYOUT,
-        disable=not show,
-        dynamic_ncols=True,
-        mininterval=often,
-    ) as bar:
+    """Show a bar while chunks are computed."""
+    with tqdm(desc=name, total=total, initial=stored, bar_format=LAYOUT, **looks(show)) as bar:
         bar.set_postfix_str("compiles what is new to this machine; time left is known after the first chunk")
-        yield Progress(bar, Pace(work, done))
+        yield Progress(bar, work, done)

@@ -14,6 +14,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from jaxmpc.check import is_count
 from jaxmpc.errors import InputError
 from jaxmpc.programs.interrupts import last_words
 from studies.definition.scenarios import Study
@@ -46,17 +47,11 @@ def run_study(
     """Compute what is missing of a study and store every chunk as soon as it is done.
 
     Args:
-        study: from `studies.load`.
         store: path that ends in ``.zarr``, or a folder that is to hold ``study.zarr``.
         workers: processes on this machine; 1 computes in this process. With more, a script of your own has to keep
             what it does below ``if __name__ == "__main__":``, as always with spawned processes.
         dask: address of a `dask.distributed` scheduler, in place of `workers`.
         command: words after ``jaxmpc study run`` that give this study, for `status`; see `chunk.study_layout`.
-        progress: whether to show a bar with rate and time left.
-        say: receives a line per event; prints it if not given.
-
-    Returns:
-        Path of the store.
 
     Raises:
         InputError: for bad arguments, a store that another run holds, a scheduler that does not answer, or a full
@@ -65,7 +60,7 @@ def run_study(
         RunError: naming the chunks that failed, after all others are stored, or the cluster that was lost.
         KeyboardInterrupt: after Ctrl-C, once the workers are stopped; says how much is stored.
     """
-    if isinstance(workers, bool) or not isinstance(workers, int) or workers < 1:
+    if not is_count(workers):
         raise InputError("workers", workers, "1 or more processes")
     if dask is not None and workers != 1:
         raise InputError("workers", workers, "1 with a dask address: the cluster has workers of its own")
@@ -123,17 +118,10 @@ def _failures(study: Study, failed: dict[int, BaseException]) -> str:
 # -------------------------------------------------------------------------------------------------------- results
 
 
-@contextlib.contextmanager
-def _executor(prepared: PreparedStudy, workers: int, client: Any, say: Say) -> Iterator[Executor]:
-    executor: Executor
+def _executor(prepared: PreparedStudy, workers: int, client: Any, say: Say) -> Executor:
     if client is not None:
-        executor = Cluster(prepared, client, say)
-    else:
-        executor = Executor(prepared) if workers == 1 else Processes(prepared, workers)
-    try:
-        yield executor
-    finally:
-        executor.stop()
+        return Cluster(prepared, client, say)
+    return Executor(prepared) if workers == 1 else Processes(prepared, workers)
 
 
 def _results(

@@ -25,19 +25,12 @@ class StudyStatus:
     """The state of a store at one moment; printed, it reads as a few lines.
 
     Attributes:
-        store: path of the store.
-        title: of the study.
-        chunks_done: stored chunks.
-        chunks_total: chunks of the study.
-        scenarios_done: scenarios in stored chunks.
-        scenarios_total: scenarios of the study.
         failed: scenarios in stored chunks that did not run to their end (``complete`` 0).
         bytes: size of the files of the study [B].
         damaged: damaged files with what is wrong; their chunks are not among the stored ones.
         rate: scenarios per second of one worker, from the recorded wall times; NaN without any.
         seconds_left: what one worker needs for the rest [s], every group by its own stored chunks (`estimate.Work`);
             NaN where the store does not say what the chunks are.
-        running: whether a run writes the store right now.
         definition: what follows ``jaxmpc study run``, quoted for a shell, as far as the provenance says; empty for a
             comparison, whose store is not given.
     """

@@ -55,16 +55,8 @@ def run_search(
     influence on what is asked next and is never on the front.
 
     Args:
-        study: from `studies.load`, of a definition with ``[search]``.
         store: path that ends in ``.zarr``, or a folder that is to hold ``study.zarr``.
-        workers: only 1, as every batch waits for the one before it; a larger ``study.chunk_size`` uses more cores.
-        dask: only None, for the same reason.
-        progress: whether to show a bar with rate and time left.
-        say: receives a line per event.
         command: words after ``jaxmpc study run`` that give this study, for `status`.
-
-    Returns:
-        Path of the store.
 
     Raises:
         InputError: for bad arguments, a store that another run holds, or a full disk; what is stored stays.

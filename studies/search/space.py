@@ -26,24 +26,16 @@ Point = tuple[tuple[Any, ...], ...]  # of one scenario: per axis one value per k
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """What one axis may be.
+    """What one axis may be."""
 
-    Attributes:
-        place: of the axis in the definition.
-        fields: of its keys; more than one where several move together.
-        entries: of an axis with values, per entry one value per key; empty for an axis with a distribution.
-        low, high: ends of a distribution, included.
-        log: whether its logarithm is even.
-        whole: whether only whole numbers are drawn.
-    """
-
-    place: str
-    fields: tuple[Field, ...]
+    place: str  # of the axis in the definition
+    fields: tuple[Field, ...]  # of its keys; more than one where several move together
+    # of an axis with values, per entry one value per key; empty for an axis with a distribution
     entries: Point = ()
-    low: float = 0.0
-    high: float = 0.0
-    log: bool = False
-    whole: bool = False
+    low: float = 0.0  # end of a distribution, included
+    high: float = 0.0  # the other end
+    log: bool = False  # whether its logarithm is even
+    whole: bool = False  # whether only whole numbers are drawn
 
     @property
     def name(self) -> str:
@@ -126,9 +118,7 @@ def check_one_group(study: Study, parameters: Sequence[Parameter], points: Seque
         return
     first, other = (points[int(group.scenarios[0])] for group in study.groups[:2])
     differ = [a for a in range(len(parameters)) if first[a] != other[a]]
-    expected = (
-        "values that share one compiled program: the same limits finite, as many whole steps in a choke move"
-    )
+    expected = "values that share one compiled program: the same limits finite"
     raise InputError(
         " with ".join(parameters[a].place for a in differ),
         ", ".join(

@@ -59,18 +59,12 @@ class SearchStudy:
     """A search, checked when it exists; made by `studies.load`.
 
     Scenario k belongs to batch ``k // chunk_size``.
-
-    Attributes:
-        definition: as written, quick cuts applied.
-        parameters: one per axis, in the order of the definition.
-        objectives: what is weighed.
-        probe: study of extremes of the parameters, all of which can start.
     """
 
-    definition: StudyDefinition
-    parameters: tuple[Parameter, ...]
-    objectives: tuple[Objective, ...]
-    probe: Study
+    definition: StudyDefinition  # as written, quick cuts applied
+    parameters: tuple[Parameter, ...]  # one per axis, in the order of the definition
+    objectives: tuple[Objective, ...]  # what is weighed
+    probe: Study  # study of extremes of the parameters, all of which can start
 
     @property
     def name(self) -> str:
@@ -105,10 +99,6 @@ class SearchStudy:
 
     def batch(self, points: Sequence[Point], index: int | None = None) -> Study:
         """An ordinary study of some points, in their order and in one group.
-
-        Args:
-            points: of each scenario, per axis one value per key.
-            index: of the batch, for errors.
 
         Raises:
             InputError: naming the axes, for points that are refused or need more than one compiled program.
@@ -179,11 +169,7 @@ class SearchStudy:
         )
 
     def layout(self, command: str | None = None) -> StoreLayout:
-        """What the store has to know: every tuned value is a variable, as it is known only with the results.
-
-        Args:
-            command: as for `chunk.study_layout`.
-        """
+        """What the store has to know: every tuned value is a variable, as it is known only with the results."""
         base, tuned, size = study_layout(self.probe, command), {}, self.chunk_size
         variables = []
         labels = {column.key: column.label for column in self.probe.columns}
@@ -244,10 +230,6 @@ def expand_search(definition: StudyDefinition, *, confirmed: bool = False) -> Se
 
     Extremes of all axes are resolved and grouped like scenarios, each alone and (up to 1024 of them) in all combinations, so
     that a space with values that no controller could run, or that need another compiled program, is refused here.
-
-    Args:
-        definition: with a search.
-        confirmed: accept more scenarios than ``study.confirmation_limit``.
 
     Raises:
         InputError: naming the path of the field.

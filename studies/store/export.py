@@ -26,13 +26,9 @@ def export(path: str | Path, target: str | Path, format: str | None = None, over
     whole data set goes through memory.
 
     Args:
-        path: of the store or the folder that holds it.
         target: the file; its suffix ``.csv``, ``.parquet`` or ``.nc`` gives the format.
         format: ``"csv"``, ``"parquet"`` or ``"netcdf"`` for another suffix.
         overwrite: replace the file if it exists.
-
-    Returns:
-        The file written.
 
     Raises:
         InputError: if the format is not known, the file exists, it cannot be written, the store cannot be read,

@@ -93,7 +93,6 @@ def changed(
     """Files that are missing or not as written, with what is wrong.
 
     Args:
-        store: the folder of the store.
         files: size by path inside the store.
         deep: read every file and compare checksums, not only sizes.
         checksums: CRC-32C of the files that do not end in it.
@@ -150,13 +149,7 @@ class Survey:
 
 
 def survey(store: Path, contents: Sequence[str], deep: bool = False) -> Survey:
-    """Look at every commit record and at the files it lists.
-
-    Args:
-        store: the folder of the store.
-        contents: wanted content hash of each chunk.
-        deep: read every file and compare checksums, not only sizes.
-    """
+    """Look at every commit record and at the files it lists."""
     result = Survey()
     for chunk, content in enumerate(contents):
         try:

@@ -8,6 +8,7 @@ of a statement does.
 from __future__ import annotations
 
 import ast
+import datetime
 import functools
 import hashlib
 import importlib
@@ -82,6 +83,14 @@ def _without_docstrings(tree: ast.Module) -> ast.Module:
             ):
                 node.body = node.body[1:] or [ast.Pass()]
     return tree
+
+
+def made_now() -> dict[str, Any]:
+    """Versions and time, for the provenance of results."""
+    return {
+        "versions": versions(),
+        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
 
 
 def versions() -> dict[str, str]:

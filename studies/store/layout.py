@@ -7,7 +7,7 @@ comparison is a list of scenarios with names, its controllers, in chunks of one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -24,40 +24,38 @@ FLAG = "complete"  # the one variable that the store also knows
 
 @dataclass(frozen=True)
 class Column:
-    """One scenario coordinate: what differs between the scenarios.
+    """One scenario coordinate: what differs between the scenarios."""
 
-    Attributes:
-        key: full key of the definition, for example ``tuning.deadzone.gas_rate``.
-        label: in words, for tables and axes.
-        unit: ``"1"`` for a number without unit, ``""`` for text.
-        values: one per scenario, numbers or text.
-    """
-
-    key: str
-    label: str
-    unit: str
-    values: np.ndarray
+    key: str  # full key of the definition, for example ``tuning.deadzone.gas_rate``
+    label: str  # in words, for tables and axes
+    unit: str  # ``"1"`` for a number without unit, ``""`` for text
+    values: np.ndarray  # one per scenario, numbers or text
 
 
 @dataclass(frozen=True)
 class Variable:
-    """One result per scenario.
+    """One result per scenario."""
 
-    Attributes:
-        name: of the variable in the store.
-        long_name: in words.
-        unit: of the values.
-        dims: axes after ``scenario``, for example ``()``, ``("cv",)`` or ``("time", "cv")``.
-        dtype: of the stored values, for example ``"f8"``.
-        empty: value before it is computed.
-    """
-
-    name: str
-    long_name: str
-    unit: str
+    name: str  # of the variable in the store
+    long_name: str  # in words
+    unit: str  # of the values
+    # axes after ``scenario``, for example ``()``, ``("cv",)`` or ``("time", "cv")``
     dims: tuple[str, ...] = ()
-    dtype: str = "f8"
-    empty: float | int = float("nan")
+    dtype: str = "f8"  # of the stored values, for example ``"f8"``
+    empty: float | int = float("nan")  # value before it is computed
+
+
+def process_axes(
+    time: np.ndarray, names: Mapping[str, Sequence[str]], units: Mapping[str, Sequence[str]]
+) -> dict[str, tuple[Any, str, str]]:
+    """The axes of trajectories as `StoreLayout.coords`: times [s], names and units of the CVs and MVs."""
+    return {
+        "time": (time, "s", "time"),
+        "cv": (list(names["cv"]), "", "controlled variable"),
+        "mv": (list(names["mv"]), "", "manipulated variable"),
+        "cv_unit": (list(units["cv"]), "", "unit of the CV"),
+        "mv_unit": (list(units["mv"]), "", "unit of the MV"),
+    }
 
 
 @dataclass(frozen=True)
@@ -65,9 +63,6 @@ class StoreLayout:
     """The store of one study before anything is computed.
 
     Attributes:
-        name: short name of the study.
-        title: one line about it.
-        study_hash: of everything that the results depend on.
         chunk_size: slots per chunk.
         chunk_scenarios: scenario numbers of each chunk, 1 to `chunk_size` of them.
         scenario_hashes: content hash of each scenario, by scenario number.

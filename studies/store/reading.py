@@ -27,9 +27,6 @@ from studies.store.template import is_trajectory
 def open_results(path: str | Path) -> xr.Dataset:
     """Open the results of a comparison.
 
-    Args:
-        path: the folder of the study, or its ``.zarr`` store.
-
     Returns:
         As `open_study`, over ``controller``, with the variables that belong to all runs: setpoints, tuning, model.
 
@@ -166,9 +163,7 @@ def read_small(store: Path, found: Survey, arrays: dict[str, Any]) -> dict[str, 
     The files are uncompressed and read directly: thousands of them through Zarr take seconds.
 
     Args:
-        store: the folder of the store.
         found: stored chunks; one with a damaged file moves to its `damaged`.
-        arrays: Zarr array of each variable.
     """
     arrays = {n: a for n, a in arrays.items() if not is_trajectory(tuple(a.metadata.dimension_names[1:]))}
     tables = {name: np.full(a.shape, a.fill_value, dtype=a.dtype) for name, a in arrays.items()}

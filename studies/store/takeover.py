@@ -23,14 +23,7 @@ class OlderStores:
     """The scenarios of a layout that older stores hold."""
 
     def __init__(self, paths: Sequence[Path], beside: Path, layout: StoreLayout, say: Callable[[str], None]):
-        """Look for them; files are read when a chunk is asked for.
-
-        Args:
-            paths: of the older stores.
-            beside: folder of the store that wants them.
-            layout: of the study that wants them.
-            say: receives a line for every file that is damaged.
-        """
+        """Look for them; files are read when a chunk is asked for."""
         self._beside, self._layout, self._say = beside, layout, say
         self._where: dict[str, tuple[Path, int, int]] = {}  # store, chunk, lane
         self._records: dict[tuple[Path, int], dict[str, Any]] = {}

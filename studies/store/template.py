@@ -174,9 +174,7 @@ class ChunkEncoder:
         """Path inside the store and content of a variable's chunk.
 
         Args:
-            variable: of the layout.
             values: ``"lane ..."``, only the real lanes.
-            chunk: number of the chunk.
         """
         array, memory = self._arrays[variable.name]
         padded = np.full(array.shape, variable.empty, dtype=array.dtype)

@@ -51,8 +51,6 @@ def run_fields(trajectory: Trajectory, wall_time: float, blocks: int) -> dict[st
     """A run of a comparison as the values of `RUN_VARIABLES`, one lane.
 
     Args:
-        trajectory: of the length of the study.
-        wall_time: of the run [s].
         blocks: of the store; the plan is not a number in those that the controller does not have.
     """
     fields = {

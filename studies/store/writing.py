@@ -69,7 +69,6 @@ class Store:
 
         Args:
             path: of the store, ending in ``.zarr``, or of a folder that is to hold it as ``study.zarr``.
-            layout: of the study.
             say: receives a line for everything that is set aside, taken over, damaged or repaired.
             verify: read every stored file once; without it only sizes are compared.
             others: stores of other studies, to take equal scenarios from.
@@ -114,7 +113,6 @@ class Store:
         """Store the results of a chunk: data first, its record last.
 
         Args:
-            chunk_index: number of the chunk.
             fields: values of every variable, ``"lane ..."`` with the real lanes only.
             facts: JSON-like, for example ``wall_time`` [s], worker and device.
 
@@ -148,11 +146,7 @@ class Store:
         return [i for i in range(len(self.layout.contents)) if i not in found.records]
 
     def verify(self) -> list[str]:
-        """Read every stored file and compare checksums; damaged chunks become pending.
-
-        Returns:
-            The damaged files, as paths inside the store with what is wrong.
-        """
+        """Read every stored file and compare checksums; damaged chunks become pending."""
         found = files.survey(self.path, self.layout.contents, deep=True)
         self._name_damage(found)
         with _disk(self.path):

@@ -14,9 +14,9 @@ from typing import Any
 
 import msgspec
 
-from jaxmpc.errors import InputError
 from studies.definition import references
 from studies.definition.comparison import ComparisonDefinition, PlantKind, ReferenceDefinition
+from studies.definition.refusing import require
 from studies.thesis.comparison import run_definition, study_name
 
 INTEGER = {"kind": "mixed-integer", "actuator": "step"}  # of a controller that says nothing else
@@ -71,8 +71,6 @@ def run_named(
         InputError: for an unknown name or plant or a folder that cannot be written, before anything is computed.
         MissingToolError: if the FMU cannot be built.
     """
-    if name not in STUDIES:
-        raise InputError("study", name, f"one of {', '.join(STUDIES)}")
-    return run_definition(
-        STUDIES[name](quick, plant), out, steady=name == "thesis", progress=progress, say=say
-    )
+    require(name in STUDIES, "study", name, f"one of {', '.join(STUDIES)}")
+    definition = STUDIES[name](quick, plant)
+    return run_definition(definition, out, steady=name == "thesis", progress=progress, say=say)

@@ -6,6 +6,7 @@ JAX well: its loops run compiled, so that a sample has no time of its own, and s
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -62,10 +63,8 @@ def run_claims(
             results = catalogue.run_named(study, out, quick, plant, progress=progress, say=say)
         data = open_results(results).load()
         hashes[study] = str(data.attrs["study_hash"])
-        clock = None
-        if plant == "jax":
-            clock = _Clock(definition, results, folder / "times.json", progress, say)
-        evidence = Evidence.of(data, clock)
+        clock = _Clock(definition, results, folder / "times.json", progress, say)
+        evidence = Evidence.of(data, clock if plant == "jax" else None)
         found |= {row.id: judge(row, evidence) for row in ROWS if row.study == study}
     claims = [found[row.id] for row in ROWS]
     _write(claims, folder, quick, plant, hashes, gallery)
@@ -88,14 +87,15 @@ def _write(
     write_atomically(folder / "claims.html", tables.page(claims, title, note, gallery))
 
 
+@dataclasses.dataclass
 class _Clock:
     """Times of controller steps by the name of the run; measured once, then read from a file."""
 
-    def __init__(
-        self, definition: ComparisonDefinition, results: Path, file: Path, progress: bool, say: Callable
-    ):
-        self.definition, self.results, self.file = definition, results, file
-        self.progress, self.say = progress, say
+    definition: ComparisonDefinition
+    results: Path
+    file: Path
+    progress: bool
+    say: Callable[[str], None]
 
     def __call__(self, name: str) -> np.ndarray:
         with open_results(self.results) as data:
@@ -103,9 +103,8 @@ class _Clock:
         known = _read(self.file, self.say)
         if key not in known:
             self.say(f"{self.definition.name}, {name}: timed on the host.")
-            known[key] = step_times(
-                self.definition, name, StepResponseModel.load(self.results / "model.json"), self.progress
-            ).tolist()
+            model = StepResponseModel.load(self.results / "model.json")
+            known[key] = step_times(self.definition, name, model, self.progress).tolist()
             write_atomically(self.file, json.dumps(known))
         return np.array(known[key])
 
@@ -124,23 +123,12 @@ def _read(file: Path, say: Callable[[str], None]) -> dict[str, list[float]]:
 def step_times(
     definition: ComparisonDefinition, name: str, model: StepResponseModel, progress: bool = False
 ) -> np.ndarray:
-    """Times of the controller steps of a run on the JAX well [s], ``"sample"``: its first `TIMED` seconds, on the host.
-
-    Args:
-        definition: of the study.
-        name: of the controller.
-        model: its prediction model.
-        progress: whether to show a bar.
-    """
+    """Times of the controller steps of a run on the JAX well [s], ``"sample"``: its first `TIMED` seconds, on the host."""
     whole = definition.reference
     duration = min(whole.duration, TIMED)
-    kept = [i for i, start in enumerate(whole.times) if start < duration]
-    reference = ReferenceDefinition(
-        tuple(whole.times[i] for i in kept), tuple(whole.setpoints[i] for i in kept), duration
-    )
+    count = sum(start < duration for start in whole.times)
+    reference = ReferenceDefinition(whole.times[:count], whole.setpoints[:count], duration)
     part = msgspec.structs.replace(definition, reference=reference)
     controller = next(one for one in definition.controllers if one.name == name)
-    run = run_controller(
-        controller, part, model, lambda actuator: HostWell(WellPlant(actuator=actuator)), progress
-    )
-    return np.asarray(run.solve_time)
+    well = lambda actuator: HostWell(WellPlant(actuator=actuator))  # noqa: E731
+    return np.asarray(run_controller(controller, part, model, well, progress).solve_time)

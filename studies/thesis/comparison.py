@@ -17,14 +17,10 @@ from identify.fmu import FmuPlant, build_fmu
 from identify.schedule import identify_schedule
 from identify.step_test import identify_step_response, identity, settling_notes
 from identify.sweep import steady_sweep
-from jaxmpc.errors import InputError
 from jaxmpc.process.plant import WellPlant
-from studies.definition.comparison import (
-    PLANTS,
-    ComparisonDefinition,
-    PlantKind,
-)
-from studies.run.comparison import run_comparison
+from studies.definition.comparison import PLANTS, ComparisonDefinition, PlantKind
+from studies.definition.refusing import require
+from studies.run.comparison import closing, labelled, run_comparison
 from studies.store.files import RESULTS
 from studies.store.writing import check_writable, locked
 
@@ -39,8 +35,7 @@ def study_name(name: str, quick: bool, plant: PlantKind) -> str:
     Raises:
         InputError: for an unknown plant.
     """
-    if plant not in PLANTS:
-        raise InputError("plant", plant, f"one of {', '.join(PLANTS)}")
+    require(plant in PLANTS, "plant", plant, f"one of {', '.join(PLANTS)}")
     return f"{name}-{'quick-' if quick else ''}{plant}"
 
 
@@ -55,25 +50,15 @@ def run_definition(
     """Build the plant, identify the model, and compute what is missing of a comparison.
 
     Args:
-        definition: of the study.
-        out: folder of all results; this study gets its own folder in it, named like the study.
+        definition: of the study; an `InputError` for one that cannot be run comes before anything is computed.
         steady: whether the results hold the steady states of `steady_variables`.
-        progress: whether to show bars with rate and time left.
-        say: receives one line per event.
-
-    Returns:
-        The folder of the study, with ``results.zarr`` (see `studies.store.reading.open_results`) and ``model.json``.
-
-    Raises:
-        InputError: for a definition that cannot be run or a folder that cannot be written, before anything is computed.
-        MissingToolError: if the FMU cannot be built.
+        out, progress, say: as for `studies.thesis.catalogue.run_named`, as are result and errors.
     """
     definition.check()
     folder = check_writable(Path(out) / definition.name)
     with locked(folder / RESULTS):
         make_plant, facts = plant_factory(definition.plant, say)
-        tested = make_plant("continuous")
-        try:
+        with closing(make_plant("continuous")) as tested:
             model = identify_step_response(tested)
             for note in settling_notes(model):
                 say(f"Identification: {note}.")
@@ -94,20 +79,12 @@ def run_definition(
                 progress=progress,
                 say=say,
             )
-        finally:
-            if isinstance(tested, FmuPlant):
-                tested.close()
 
 
 def plant_factory(
     kind: PlantKind, say: Callable[[str], None] = print
 ) -> tuple[Callable[[str], Any], dict[str, Any]]:
-    """How to make the plant with a given actuator, and the facts that identify it.
-
-    Args:
-        kind: ``fmu`` or ``jax``.
-        say: receives a line about the FMU.
-    """
+    """How to make the plant with a given actuator, and the facts that identify it."""
     if kind == "jax":
         known, digest = identity(WellPlant())
         return (lambda actuator: WellPlant(actuator=actuator)), {"kind": known, "hash": digest}
@@ -120,9 +97,6 @@ def plant_factory(
 
 def steady_variables(plant: Any) -> dict[str, xr.DataArray]:
     """Steady states of the well for the results: the sweep of 4.1.1 and a map over choke and lift.
-
-    Args:
-        plant: a `WellPlant` or an `FmuPlant`.
 
     Returns:
         ``sweep_coefficient`` over ``cv, sweep_lift, sweep_choke`` (figures 10 and 11) and ``map_rate`` over
@@ -144,19 +118,7 @@ def steady_variables(plant: Any) -> dict[str, xr.DataArray]:
 def over_inputs(
     prefix: str, choke: np.ndarray, lift: np.ndarray, values: np.ndarray, words: str, unit: str
 ) -> xr.DataArray:
-    """Values ``"cv lift choke"`` of the results over axes of their own.
-
-    Args:
-        prefix: of the names of the axes, ``PREFIX_lift`` and ``PREFIX_choke``.
-        choke: positions [%].
-        lift: rates [m3/h].
-        values: ``"cv lift choke"``.
-        words: what they are.
-        unit: of the values.
-    """
+    """Values ``"cv lift choke"`` of the results over axes of their own, ``PREFIX_lift`` [m3/h] and ``PREFIX_choke`` [%]."""
     x, y = f"{prefix}_choke", f"{prefix}_lift"
-    coords = {
-        x: (x, choke, {"long_name": "choke", "units": "%"}),
-        y: (y, lift, {"long_name": "gas lift", "units": "m3/h"}),
-    }
-    return xr.DataArray(values, coords, ("cv", y, x), attrs={"long_name": words, "units": unit})
+    axes = {x: (choke, "choke", "%"), y: (lift, "gas lift", "m3/h")}
+    return labelled(values, ("cv", y, x), words, unit, **axes)

@@ -12,6 +12,7 @@ import math
 from fractions import Fraction
 
 from jaxmpc.errors import InputError
+from studies.definition.refusing import require
 
 Point = tuple[Fraction, Fraction]
 
@@ -35,15 +36,10 @@ class Row:
 
 @dataclasses.dataclass(frozen=True)
 class IntegerProgram:
-    """Maximise ``objective . x`` over the integer points that satisfy every row.
+    """Maximise ``objective . x`` over the integer points that satisfy every row."""
 
-    Attributes:
-        objective: coefficients of the two variables.
-        rows: they must enclose a bounded set, the signs of the variables included.
-    """
-
-    objective: Point
-    rows: tuple[Row, ...]
+    objective: Point  # coefficients of the two variables
+    rows: tuple[Row, ...]  # they must enclose a bounded set, the signs of the variables included
 
     def value(self, point: Point) -> Fraction:
         """Objective at a point."""
@@ -56,19 +52,13 @@ class IntegerProgram:
 
 @dataclasses.dataclass(frozen=True)
 class Cut:
-    """A valid inequality and why it is one.
+    """A valid inequality and why it is one."""
 
-    Attributes:
-        row: the inequality, with coprime integer coefficients.
-        optimum: optimum of the relaxation once the row is added.
-        rows: the rows of the problem that it is combined from.
-        multipliers: of these rows: the combination has the cut's left side, and its right side rounded down is the
-            cut's limit (a Chvatal-Gomory cut).
-    """
-
-    row: Row
-    optimum: Point
-    rows: tuple[Row, ...]
+    row: Row  # the inequality, with coprime integer coefficients
+    optimum: Point  # optimum of the relaxation once the row is added
+    rows: tuple[Row, ...]  # the rows of the problem that it is combined from
+    # of these rows: the combination has the cut's left side, and its right side rounded down is the cut's
+    # limit (a Chvatal-Gomory cut)
     multipliers: tuple[Fraction, ...]
 
 
@@ -104,8 +94,7 @@ def corners(program: IntegerProgram) -> list[Point]:
     """
     found = {crossing(*pair) for pair in itertools.combinations(program.rows, 2)}
     inside = [point for point in found if point is not None and program.holds(point)]
-    if not inside:
-        raise InputError("program.rows", len(program.rows), "rows that some point satisfies")
+    require(inside, "program.rows", len(program.rows), "rows that some point satisfies")
     return hull(inside)
 
 
@@ -120,14 +109,10 @@ def integer_points(program: IntegerProgram) -> list[Point]:
     Raises:
         InputError: if there is none.
     """
-    spread = []
-    for axis in (0, 1):
-        values = [point[axis] for point in corners(program)]
-        spread.append(range(math.ceil(min(values)), math.floor(max(values)) + 1))
+    spread = (range(math.ceil(min(x)), math.floor(max(x)) + 1) for x in zip(*corners(program), strict=True))
     points = [(Fraction(i), Fraction(j)) for i, j in itertools.product(*spread)]
     found = [point for point in points if program.holds(point)]
-    if not found:
-        raise InputError("program.rows", len(program.rows), "rows that some integer point satisfies")
+    require(found, "program.rows", len(program.rows), "rows that some integer point satisfies")
     return found
 
 
@@ -185,10 +170,8 @@ def best_cut(program: IntegerProgram) -> Cut:
     """
     x = relaxed_optimum(program)
     cutting = [row for row in facets(hull(integer_points(program))) if row.excess(x) > 0]
-    if not cutting:
-        raise InputError(
-            "program", "an integer relaxed optimum", "a relaxed optimum outside the integer hull"
-        )
+    expected = "a relaxed optimum outside the integer hull"
+    require(cutting, "program", "an integer relaxed optimum", expected)
 
     def after(row: Row) -> Point:
         return relaxed_optimum(dataclasses.replace(program, rows=(*program.rows, row)))

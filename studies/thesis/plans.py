@@ -11,32 +11,19 @@ import dataclasses
 import numpy as np
 import xarray as xr
 
-from jaxmpc.errors import InputError
-from studies.definition.presets import CHOKE
-from studies.kpi import loop as kpi
+from studies.definition.refusing import require
 from studies.store.reading import provenance
-
-SMALLEST_MOVE = 1e-6  # % choke, less is rounding
-LONGEST_SWING = 1000.0  # s
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StoredPlan:
-    """What a controller planned at one time.
+    """What a controller planned at one time."""
 
-    Attributes:
-        time: when the plan was made [s].
-        move: ``"sample mv"``, planned moves of the Hu samples, row 0 the move made at `time` [MV unit].
-        mv: ``"sample mv"``, the MVs after each of these moves [MV unit].
-        cv: ``"horizon cv"``, predicted CVs at 1..Hp samples after `time` [CV unit].
-        dt: sampling interval [s].
-    """
-
-    time: float
-    move: np.ndarray
-    mv: np.ndarray
-    cv: np.ndarray
-    dt: float
+    time: float  # when the plan was made [s]
+    move: np.ndarray  # "sample mv", planned moves of the Hu samples, row 0 the move made at `time` [MV unit]
+    mv: np.ndarray  # "sample mv", the MVs after each of these moves [MV unit]
+    cv: np.ndarray  # "horizon cv", predicted CVs at 1..Hp samples after `time` [CV unit]
+    dt: float  # sampling interval [s]
 
     @property
     def move_time(self) -> np.ndarray:
@@ -62,20 +49,16 @@ def plan_at(data: xr.Dataset, controller: str, time: float) -> StoredPlan:
     """
     run = _finished(data, controller)
     written = provenance(data, "definition")["controllers"]
-    if any(entry.get("schedule") for entry in written if entry["name"] == controller):
-        raise InputError(
-            "controller", controller, "one with a single model; those of a gain schedule are not stored"
-        )
+    scheduled = any(entry.get("schedule") for entry in written if entry["name"] == controller)
+    expected = "one with a single model; those of a gain schedule are not stored"
+    require(not scheduled, "controller", controller, expected)
     dt = float(data.attrs["dt"])
     times = data.time.values
     k = int(np.floor(time / dt + 1e-9)) if np.isfinite(time) else -1
-    if not 0 <= k < len(times):
-        raise InputError("time", time, f"a time of the run, {times[0]:g} to {times[-1]:g} s")
+    require(0 <= k < len(times), "time", time, f"a time of the run, {times[0]:g} to {times[-1]:g} s")
     move = _sample_moves(run, run.plan.values[k])
-    if np.isnan(move).any():
-        raise InputError(
-            "time", time, "a time at which a plan was made, not one at which a plan is carried out"
-        )
+    expected = "a time at which a plan was made, not one at which a plan is carried out"
+    require(not np.isnan(move).any(), "time", time, expected)
     made = run.move.values[:k]
     horizon = int(run.prediction_horizon)
     steps = data.model_coefficient.values  # "cv mv lag", S(1)..S(N)
@@ -88,46 +71,11 @@ def plan_at(data: xr.Dataset, controller: str, time: float) -> StoredPlan:
     return StoredPlan(float(times[k]), move, before + np.cumsum(move, axis=0), cv, dt)
 
 
-def oscillation_moves(data: xr.Dataset, controller: str, around: float) -> tuple[float, float, float]:
-    """Times of three choke moves of an oscillation: the first of a swing, of the swing back, and of the one after it.
-
-    A swing is all moves in one direction until the choke turns, often a single move. Swings that begin more than
-    `LONGEST_SWING` after each other are no oscillation.
-
-    Args:
-        data: results from `studies.store.reading.open_results`.
-        controller: name of a finished run.
-        around: the oscillation whose second swing begins nearest to this time is taken [s].
-
-    Returns:
-        Starts of the samples whose moves they are [s].
-
-    Raises:
-        InputError: for an unknown or unfinished controller, and where the choke never oscillates.
-    """
-    run = _finished(data, controller)
-    choke = list(data.mv.values).index(CHOKE)
-    start = run.demand.values[0, choke] - run.move.values[0, choke]
-    moves = np.asarray(kpi.moves_of(run.position.values[:, choke], start))
-    at = np.flatnonzero(np.abs(moves) > SMALLEST_MOVE)
-    turned = np.sign(moves[at[1:]]) != np.sign(moves[at[:-1]])
-    begin = data.time.values[at[np.r_[True, turned][: at.size]]]
-    soon = np.diff(begin) <= LONGEST_SWING
-    middle = 1 + np.flatnonzero(soon[:-1] & soon[1:])
-    if middle.size == 0:
-        raise InputError("controller", controller, "a run in which the choke oscillates")
-    best = middle[np.argmin(np.abs(begin[middle] - around))]
-    first, second, third = begin[best - 1 : best + 2].tolist()
-    return first, second, third
-
-
 def _finished(data: xr.Dataset, controller: str) -> xr.Dataset:
     names = list(data.controller.values)
     finished = [name for name, done in zip(names, data.complete.values, strict=True) if done == 1]
-    if controller not in finished:
-        raise InputError(
-            "controller", controller, f"a finished run: {', '.join(finished) or 'there is none'}"
-        )
+    expected = f"a finished run: {', '.join(finished) or 'there is none'}"
+    require(controller in finished, "controller", controller, expected)
     return data.isel(controller=names.index(controller))
 
 

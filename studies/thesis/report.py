@@ -42,11 +42,7 @@ def write_summary(folder: str | Path, study: str) -> list[Path]:
 
 
 def summary_table(figures: xr.Dataset) -> list[tuple[str, list[str]]]:
-    """The rows of the summary: what it is with its unit, and one text per controller.
-
-    Args:
-        figures: from `studies.kpi.evaluate.key_figures`.
-    """
+    """The rows of the summary from `key_figures`: what it is with its unit, and one text per controller."""
     runs = [_run_texts(figures.isel(controller=i)) for i in range(figures.sizes["controller"])]
     return [(what, [run[what] for run in runs]) for what in runs[0]]
 
@@ -59,21 +55,20 @@ def _run_texts(run: xr.Dataset) -> dict[str, str]:
         return " / ".join(f"{scale * value(key, cv=cv):{form}}" for cv in (GAS, OIL))
 
     gap = value("largest_gap")
-    dwell = f"{value('mean_dwell'):.0f} / {value('shortest_dwell'):.0f}"
     times = [1e3 * value(f"solve_time_{key}") for key in ("median", "p99", "max")]
     violations = [f"{value(key):.0f}" for key in ("cv_violations", "mv_violations", "move_violations")]
     return {
         "choke travel [%]": f"{value('choke_travel'):.0f}",
         "choke moves / reversals": f"{value('choke_moves'):.0f} / {value('choke_reversals'):.0f}",
         "reversals in 2nd half of each window": " ".join(str(v) for v in run.late_reversals.values),
-        "time between moves, mean / shortest [s]": dwell,
+        "time between moves, mean / shortest [s]": f"{value('mean_dwell'):.0f} / {value('shortest_dwell'):.0f}",
         "lift travel [1000 m3/h]": f"{value('lift_travel') / 1000:.1f}",
         "mean deviation, gas / oil [m3/h]": both("mean_absolute_deviation", ".4g"),
         "time outside deadzone, gas / oil [min]": both("time_outside_deadzone", ".0f", 1 / 60),
         "limit violations, CV / MV / move [samples]": " / ".join(violations),
         "largest mean opening [%/sample]": f"{value('largest_mean_opening'):.3f}",
         "pauses of the staircase": f"{value('mean_move_stops'):.0f}",
-        "solve time, median / p99 / max [ms]": " / ".join(_three_digits(t) for t in times),
+        "solve time, median / p99 / max [ms]": " / ".join(map(_three_digits, times)),
         "largest gap": f"{gap:.2g}" if np.isfinite(gap) else "none proven",
         "not optimal / MVs held [samples]": f"{value('not_optimal'):.0f} / {value('fallbacks'):.0f}",
     }
@@ -81,18 +76,12 @@ def _run_texts(run: xr.Dataset) -> dict[str, str]:
 
 def _three_digits(value: float) -> str:
     """A positive number with about three digits and never with an exponent."""
-    return (
-        f"{value:.{max(0, 2 - int(np.floor(np.log10(value))))}f}" if 1e-3 < value < np.inf else f"{value:.0f}"
-    )
+    digits = 2 - int(np.floor(np.log10(value))) if 1e-3 < value < np.inf else 0
+    return f"{value:.{max(0, digits)}f}"
 
 
 def markdown(data: xr.Dataset, statements: bool = True) -> str:
-    """The summary as Markdown: key figures per controller, then the statements of the thesis with their verdicts.
-
-    Args:
-        data: results with a finished run.
-        statements: whether the runs are those of the thesis study, which its statements are about.
-    """
+    """The summary as Markdown: key figures per controller, then the statements of the thesis study with their verdicts."""
     figures = key_figures(data)
     head = ["", *(str(label) for label in figures.label.values)]
     lines = [f"# {data.attrs.get('title', 'Summary')}", ""]
@@ -105,12 +94,7 @@ def markdown(data: xr.Dataset, statements: bool = True) -> str:
 
 def limits_markdown(steps: list[LimitedSteps]) -> str:
     """What limited solve times cost as a Markdown table, one row per controller; percent of the exact optimum."""
-    head = (
-        "",
-        "steps that reach their limit",
-        "proven gap, median",
-        "objective lost: median / 90 % / most",
-    )
+    head = ("", "steps that reach their limit", "proven gap, median", "objective lost: median / 90 % / most")
     rows = []
     for one in steps:
         # the optimum itself is known to a relative gap of 1e-6

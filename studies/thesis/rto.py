@@ -21,7 +21,7 @@ from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.targets import TargetController
 from jaxmpc.files import write_atomically
 from jaxmpc.loop.reference import Reference
-from jaxmpc.loop.simulate import Progress, simulate
+from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.targets import simulate_with_targets
 from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.model.step_response import StepResponseModel
@@ -31,7 +31,7 @@ from jaxmpc.steady.optimise import LIFT_RANGES, Targets, optimise
 from studies.definition import presets
 from studies.definition.comparison import PlantKind
 from studies.definition.presets import CHOKE, GAS, LIFT, OIL
-from studies.run.comparison import closing, progress_bar, results_layout, run_missing
+from studies.run.comparison import closing, labelled, progress_bar, results_layout, run_missing
 from studies.store.files import RESULTS
 from studies.store.fingerprint import content_hash, module_hash, source_hash
 from studies.store.layout import StoreLayout
@@ -51,11 +51,7 @@ WINDOWS = (
 )
 DURATION, QUICK_DURATION = 28_800.0, 12_000.0  # s; the quick run ends before the third window
 PRICES = {GAS: 0.1, OIL: 400.0, LIFT: 0.3}  # per m3
-OPTIMISING = (
-    "jaxmpc.steady.optimise",
-    "jaxmpc.steady.milp",
-    "jaxmpc.steady.map",
-)  # modules that set the targets
+OPTIMISING = tuple(f"jaxmpc.steady.{name}" for name in ("optimise", "milp", "map"))  # set the targets
 SETTLED = 300.0  # s at the end of a window that stand for where a run settles
 TARGET_WEIGHT = {CHOKE: 1.0, LIFT: 1e-3}  # 1/(%)^2, 1/(m3/h)^2
 
@@ -68,13 +64,7 @@ def demands(quick: bool = False) -> Reference:
 
 
 def targets_of(steady: SteadyMap, demanded: Reference, deadzone: np.ndarray) -> list[Targets]:
-    """What the real-time optimisation makes of each demand: the most profitable point within its deadzone.
-
-    Args:
-        steady: map of the well.
-        demanded: rates over time.
-        deadzone: half width per CV [CV unit].
-    """
+    """What the real-time optimisation makes of each demand: the most profitable point within its deadzone [CV unit]."""
     return [
         optimise(steady, PRICES, rates - deadzone, rates + deadzone, choke_step=presets.CHOKE_STEP)
         for rates in demanded.setpoints
@@ -119,20 +109,17 @@ def run_rto(
         shared = _shared(demanded, found, np.asarray(tuning.deadzone), steady, structure.dt)
         layout = _layout(folder.name, demanded, found, facts, model, structure, shared)
 
-        def close(name: str, well: Any, report: Progress | None) -> Trajectory:
-            if name == WITHOUT:
-                return simulate(Controller(structure, tuning, model), well, demanded, progress=report)
-            setpoints, ideal = (
-                Reference(demanded.times, [getattr(each, key) for each in found], demanded.duration)
-                for key in ("cv", "mv")
-            )
-            controller = TargetController(structure, tuning, model, TARGET_WEIGHT)
-            return simulate_with_targets(controller, well, setpoints, ideal, progress=report)
-
         def run(i: int) -> Trajectory:
             name, label = list(LABELS.items())[i]
             with closing(make_plant("step")) as well, progress_bar(label, progress) as report:
-                return close(name, well, report)
+                if name == WITHOUT:
+                    return simulate(Controller(structure, tuning, model), well, demanded, progress=report)
+                setpoints, ideal = (
+                    Reference(demanded.times, [getattr(each, key) for each in found], demanded.duration)
+                    for key in ("cv", "mv")
+                )
+                controller = TargetController(structure, tuning, model, TARGET_WEIGHT)
+                return simulate_with_targets(controller, well, setpoints, ideal, progress=report)
 
         run_missing(folder, layout, run, say)
     write_atomically(folder / "summary.md", markdown(open_results(folder).load()))
@@ -161,7 +148,6 @@ def _layout(
         "code": code,
     }
     hashes = [content_hash(inputs, WITHOUT), content_hash(inputs, WITH, TARGET_WEIGHT)]
-    study_hash = content_hash(name, hashes)
     provenance = {
         "study": name,
         "title": "Low demands: mixed-integer MPC with and without real-time optimisation",
@@ -172,7 +158,6 @@ def _layout(
         "messages": [each.message for each in found],
         "code": code,
     }
-
     return results_layout(
         controllers=LABELS,
         hashes=hashes,
@@ -181,7 +166,7 @@ def _layout(
         blocks=structure.block_count,
         shared=lambda: shared,
         provenance=provenance,
-        study_hash=study_hash,
+        study_hash=content_hash(name, hashes),
     )
 
 
@@ -194,44 +179,25 @@ def _shared(
     setpoint, target = np.stack([rates, cv]), np.stack([np.full_like(mv, np.nan), mv])
     profit = np.array([each.profit for each in found])
     lanes = ("controller", "time")
-    variables: dict[str, tuple[np.ndarray, tuple[str, ...], str, str]] = {
-        "demanded": (rates, ("time", "cv"), "demanded CV", "cv_unit"),
-        "setpoint": (setpoint, (*lanes, "cv"), "setpoint", "cv_unit"),
-        "target": (target, (*lanes, "mv"), "input target", "mv_unit"),
-        "window": (window.astype("i4"), ("time",), "index of the demand", "1"),
-        "profit": (profit, ("demand",), "steady profit of the target", "1/h"),
-        "tuning_deadzone": (
-            np.tile(deadzone, (2, 1)),
-            ("controller", "cv"),
-            "half width of the deadzone",
-            "cv_unit",
-        ),
+    half = np.tile(deadzone, (2, 1))
+    texts = {
+        name: xr.DataArray(np.array([value] * 2, dtype=np.dtypes.StringDType()), dims="controller")
+        for name, value in {"kind": "mixed-integer", "actuator": "step"}.items()
     }
-    out = {
-        name: xr.DataArray(values, dims=dims, attrs={"long_name": long_name, "units": unit})
-        for name, (values, dims, long_name, unit) in variables.items()
-    }
-    for name, value in {"kind": "mixed-integer", "actuator": "step"}.items():
-        out[name] = xr.DataArray(np.array([value] * 2, dtype=np.dtypes.StringDType()), dims="controller")
-    return out | {
-        "map_rate": over_inputs("map", steady.choke, steady.lift, steady.cv, "steady CV", "cv_unit")
+    return {
+        "demanded": labelled(rates, ("time", "cv"), "demanded CV", "cv_unit"),
+        "setpoint": labelled(setpoint, (*lanes, "cv"), "setpoint", "cv_unit"),
+        "target": labelled(target, (*lanes, "mv"), "input target", "mv_unit"),
+        "window": labelled(window.astype("i4"), ("time",), "index of the demand", "1"),
+        "profit": labelled(profit, ("demand",), "steady profit of the target", "1/h"),
+        "tuning_deadzone": labelled(half, ("controller", "cv"), "half width of the deadzone", "cv_unit"),
+        **texts,
+        "map_rate": over_inputs("map", steady.choke, steady.lift, steady.cv, "steady CV", "cv_unit"),
     }
 
 
 def markdown(data: xr.Dataset) -> str:
-    """Where both runs settle for each demand as a Markdown table: means over the last `SETTLED` seconds of its window.
-
-    Args:
-        data: results of `run_rto`, both runs finished.
-    """
-    head = (
-        "gas / oil demanded [m3/h]",
-        "run",
-        "choke [%]",
-        "lift [m3/h]",
-        "gas / oil off the demand [m3/h]",
-        "half widths off",
-    )
+    """Where both runs settle for each demand as a Markdown table: means over the last `SETTLED` seconds of its window."""
     rows = []
     window, half = data.window.values, data.tuning_deadzone.isel(controller=0)
     samples = round(SETTLED / float(data.attrs["dt"]))
@@ -244,14 +210,14 @@ def markdown(data: xr.Dataset) -> str:
             choke, lift = (float(run.position.sel(mv=mv).mean()) for mv in (CHOKE, LIFT))
             far = float((np.abs(off) / half).max())
             asked, away = ([float(v.sel(cv=cv)) for cv in (GAS, OIL)] for v in (rates, off))
-            rows.append(
-                (
-                    f"{asked[0]:.0f} / {asked[1]:.0f}",
-                    str(run.label.item()),
-                    f"{choke:.1f}",
-                    f"{lift:.0f}",
-                    f"{away[0]:+.0f} / {away[1]:+.1f}",
-                    f"{far:.2f}",
-                )
-            )
-    return "\n".join([f"# {data.attrs['title']}", "", *markdown_table(head, rows), ""])
+            row = {
+                "gas / oil demanded [m3/h]": f"{asked[0]:.0f} / {asked[1]:.0f}",
+                "run": str(run.label.item()),
+                "choke [%]": f"{choke:.1f}",
+                "lift [m3/h]": f"{lift:.0f}",
+                "gas / oil off the demand [m3/h]": f"{away[0]:+.0f} / {away[1]:+.1f}",
+                "half widths off": f"{far:.2f}",
+            }
+            rows.append(row)
+    table = markdown_table(list(rows[0]), [list(row.values()) for row in rows])
+    return "\n".join([f"# {data.attrs['title']}", "", *table, ""])

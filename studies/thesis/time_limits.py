@@ -21,31 +21,19 @@ from studies.definition.comparison import ControllerDefinition
 
 
 class LimitedSteps(NamedTuple):
-    """The steps of a run that ended at their time limit.
-
-    Attributes:
-        label: of the controller.
-        share: of all steps, 0..1.
-        gap: median of the relative gaps that were proven.
-        lost: relative to the exact optimum of the same step, the median, the 90th percentile and the most.
-    """
+    """The steps of a run that ended at their time limit."""
 
     label: str
-    share: float
-    gap: float
+    share: float  # of all steps, 0..1
+    gap: float  # median of the relative gaps that were proven
+    # relative to the exact optimum of the same step, the median, the 90th percentile and the most
     lost: tuple[float, float, float]
 
 
 def limited_steps(
     data: xr.Dataset, definitions: Iterable[ControllerDefinition], model: StepResponseModel
 ) -> list[LimitedSteps]:
-    """What the time limits of stored runs cost, one entry per controller with a limit; NaN where no step reached it.
-
-    Args:
-        data: results from `studies.store.reading.open_results`, every run finished.
-        definitions: of the controllers that ran.
-        model: their prediction model, ``model.json`` in the folder of the study.
-    """
+    """What the time limits of finished runs cost, one entry per controller with a limit; NaN where no step reached it."""
     out = []
     for definition in definitions:
         if definition.time_limit is None:
@@ -68,11 +56,6 @@ def objective_loss(
 
     The state of the controller is replayed from the stored measurements and plans, and the steps that ended at the limit
     are solved again without one. Zero for steps that were solved to the end, not a number for steps without a plan.
-
-    Args:
-        data: results from `studies.store.reading.open_results`.
-        definition: of the controller that ran.
-        model: its prediction model, ``model.json`` in the folder of the study.
     """
     run = data.sel(controller=definition.name).load()
     exact = Controller(definition.structure(), definition.build_tuning(), model)

@@ -80,13 +80,13 @@ def test_models_may_have_lanes(structure, tunings, models):
     assert_same(one_tuning.lane(2), alone(structure, tunings[1], models[2], summed=False))
 
 
-def test_value_and_axes_are_what_vmap_takes(structure, tunings, well_like_model):
+def test_a_function_of_lanes_is_mapped_over_what_they_do_not_share(structure, tunings, well_like_model):
     cores = Controllers(structure, tunings, well_like_model).cores
     cv, mv, setpoint = np.array([11000.0, 185.0]), np.array([50.0, 7500.0]), np.array([12000.0, 180.0])
     rows = np.tile(setpoint, (cores.shared.size.future, 1))
     sample = Sample(cv, rows, np.full(2, np.nan), np.zeros(2, dtype=bool))
     one = lambda core: core.conclude(core.consider(core.init(cv, mv), sample, 1e-6))[1].moves  # noqa: E731
-    together = jax.jit(jax.vmap(one, in_axes=(cores.axes,)))(cores.value)
+    together = jax.jit(lambda cores: cores.vmap(one))(cores)
     for k, tuning in enumerate(tunings):
         controller = Controller(structure, tuning, well_like_model)
         own = controller.step(controller.init(cv, mv), cv, setpoint)[1].moves

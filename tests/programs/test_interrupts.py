@@ -250,7 +250,7 @@ def test_a_benchmark_that_is_stopped_prints_what_it_has(monkeypatch, capsys, tmp
     from studies.bench import rows, run
 
     def stopped(context):
-        yield rows.timed("done", "relaxed", [1e-3], [0.0])
+        yield rows.timed("done", [1e-3], [0.0])
         raise KeyboardInterrupt
 
     monkeypatch.setitem(run.SECTIONS, "relaxed", stopped)

@@ -10,6 +10,7 @@ from figures.thesis.solve_time import draw_benchmark
 from identify.step_test import identify_step_response
 from jaxmpc.cli import main as cli
 from jaxmpc.cli.options import parser as make_parser
+from jaxmpc.controller.plan import Planner
 from jaxmpc.errors import InputError
 from jaxmpc.loop.reference import Reference
 from studies.bench import forms, instances, peers, rows, run
@@ -161,8 +162,9 @@ def test_a_replayed_sample_is_the_problem_that_the_controller_solved(model, refe
     replayed = replay(controller, recording)
     np.testing.assert_allclose(replayed.mv_now[1:], recording.mv_demand[:-1], rtol=1e-12)
     np.testing.assert_allclose(replayed.last_move[1:], recording.move[:-1])
+    planner = Planner(controller.structure, controller.tuning, model)
     for k in (12, 15):
-        plan = controller.planner.solve(**replayed.at(k), recover=True)
+        plan = planner.solve(**replayed.at(k), recover=True)
         np.testing.assert_allclose(plan.moves[0], recording.move[k], atol=1e-4 * 200)
 
 
@@ -274,21 +276,21 @@ def test_batches_have_rates_and_figures(cache, tmp_path):
 
 def test_a_row_without_a_measurement_meets_nothing_and_a_wrong_one_misses():
     goal = rows.Goal("median_ms", 10.0)
-    good = rows.timed("a", "s", [1e-3], [0.0], goals=(goal,))
+    good = rows.timed("a", [1e-3], [0.0], goals=(goal,))
     assert goal.met(good) is True
-    assert goal.met(rows.timed("a", "s", [1e-3], [1e-3])) is False
-    assert goal.met(rows.timed("a", "s", [1.0], [0.0])) is False
-    assert goal.met(rows.Row(name="a", section="s", status="not measured")) is None
+    assert goal.met(rows.timed("a", [1e-3], [1e-3])) is False
+    assert goal.met(rows.timed("a", [1.0], [0.0])) is False
+    assert goal.met(rows.Row(name="a", status="not measured")) is None
     ratio = rows.Goal("ratio", 1000.0)
-    cut_off = rows.timed("a", "s", [1e-3], [0.0], ratio=500.0, ratio_is_lower_bound=True)
+    cut_off = rows.timed("a", [1e-3], [0.0], ratio=500.0, ratio_is_lower_bound=True)
     assert ratio.met(cut_off) is None
-    unsolved = rows.timed("a", "s", [1.0], [np.nan])
+    unsolved = rows.timed("a", [1.0], [np.nan])
     assert (unsolved.solved, unsolved.worst_error, unsolved.counts) == (0, None, False)
 
 
 def test_an_interrupt_leaves_the_rows_so_far(tmp_path, monkeypatch):
     def stopped(context: Context):
-        yield rows.timed("done", "relaxed", [1e-3], [0.0])
+        yield rows.timed("done", [1e-3], [0.0])
         raise KeyboardInterrupt
 
     monkeypatch.setitem(run.SECTIONS, "relaxed", stopped)
@@ -307,13 +309,11 @@ def test_an_interrupt_leaves_the_rows_so_far(tmp_path, monkeypatch):
 
 def test_an_error_ends_its_section_alone(monkeypatch):
     def broken(context: Context):
-        yield rows.timed("done", "relaxed", [1e-3], [0.0])
+        yield rows.timed("done", [1e-3], [0.0])
         raise ValueError("no such thing")
 
     monkeypatch.setitem(run.SECTIONS, "relaxed", broken)
-    monkeypatch.setitem(
-        run.SECTIONS, "batch", lambda context: iter([rows.timed("next", "batch", [1.0], [0.0])])
-    )
+    monkeypatch.setitem(run.SECTIONS, "batch", lambda context: iter([rows.timed("next", [1.0], [0.0])]))
     report = measure("relaxed,batch")
     assert [row.name for row in report.rows] == ["done", "relaxed: ended early", "next"]
     assert not report.complete
@@ -332,7 +332,7 @@ def test_an_unknown_section_is_refused_before_anything_is_measured(only, tmp_pat
 
 
 def test_the_command_prints_the_table_and_tells_by_its_status_whether_it_came_to_its_end(monkeypatch, capsys):
-    row = rows.timed("done", "relaxed", [1e-3], [0.0])
+    row = rows.timed("done", [1e-3], [0.0])
     monkeypatch.setitem(run.SECTIONS, "relaxed", lambda context: iter([row]))
     assert cli.main(["bench", "--only", "relaxed"]) == 0
     assert "done" in capsys.readouterr().out
@@ -343,7 +343,7 @@ def test_the_command_prints_the_table_and_tells_by_its_status_whether_it_came_to
 
 
 def wrong_row() -> rows.Row:
-    return rows.timed("relaxed QP, moves: jaxmpc warm", "relaxed", [1e-3], [1.0])
+    return rows.timed("relaxed QP, moves: jaxmpc warm", [1e-3], [1.0])
 
 
 def test_the_sections_that_the_help_names_are_those_there_are():

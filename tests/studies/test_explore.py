@@ -26,6 +26,7 @@ from studies.definition.presets import CHOKE
 from studies.notebooks import launch
 from studies.notebooks import loop as explore
 from studies.notebooks.loop import RUN, Settings, main, run, shown_figures, written
+from studies.thesis.plans import plan_at
 from tests import studies_synthetic
 from tests.sweep_synthetic import DEADZONE, OIL_DEADZONE, WEIGHT, grid, numbers, runs, write
 
@@ -149,16 +150,10 @@ def test_the_key_figures_are_those_of_the_run(mixed):
 def test_the_first_planned_move_is_the_one_that_was_made(name, request):
     done = request.getfixturevalue(name)
     for sample in (0, 30, 179):
-        plan = done.plan_at(sample)
+        plan = plan_at(done.data, RUN, 10.0 * sample)
         np.testing.assert_allclose(plan.move[0], done.trajectory.move[sample], atol=1e-6)
         np.testing.assert_allclose(plan.mv[0], done.trajectory.mv_demand[sample], atol=1e-6)
         assert plan.cv.shape == (250, 2)
-
-
-def test_a_plan_outside_the_run_is_refused(mixed):
-    for sample in (-1, 180):
-        with pytest.raises(InputError, match="0 to 179"):
-            mixed.plan_at(sample)
 
 
 @pytest.mark.parametrize("name", ["continuous", "mixed"])
@@ -236,7 +231,7 @@ def test_a_run_is_drawn_beside_the_pinned_one(mixed, continuous):
 def test_the_plan_of_a_time_is_drawn_from_that_time_on(mixed):
     figure = draw.planned(mixed.data, 600.0)
     (plan,) = [line for line in figure.axes[0].lines if line.get_label() == "plan"]
-    expected = mixed.plan_at(60)
+    expected = plan_at(mixed.data, RUN, 600.0)
     np.testing.assert_allclose(plan.get_xdata() * 60, expected.cv_time)
     np.testing.assert_allclose(plan.get_ydata(), expected.cv[:, 1])
     assert draw.png(draw.planned(mixed.data, 0.0)).startswith(PNG)

@@ -334,20 +334,6 @@ def test_plans_of_fewer_blocks_are_filled_up_and_read_as_they_were(tmp_path):
         np.testing.assert_array_equal(plans.plan_at(data, name, 50.0).move, np.full((200, 2), move))
 
 
-def test_an_oscillation_is_found_by_its_three_moves(tmp_path):
-    data = open_results(made.stored(tmp_path)).load()
-    # from sample 30 on the choke moves every ten samples, up and down in turn
-    assert plans.oscillation_moves(data, "step-choke", 2010.0) == (1900.0, 2000.0, 2100.0)
-    assert plans.oscillation_moves(data, "step-choke", 1e6) == (3700.0, 3800.0, 3900.0)
-    with pytest.raises(InputError, match="the choke oscillates"):
-        plans.oscillation_moves(data, "mixed-integer", 2000.0)
-    # swings of two moves each, with a pause of three samples before the choke turns
-    position = 40.0 + np.tile([2.0, 4.0, 4.0, 4.0, 4.0, 2.0, 0.0, 0.0, 0.0, 0.0], 40)
-    wide = data.assign(position=data.position.copy())
-    wide.position.loc[{"controller": "mixed-integer", "mv": "choke"}] = position
-    assert plans.oscillation_moves(wide, "mixed-integer", 2010.0) == (1950.0, 2000.0, 2050.0)
-
-
 # whole studies
 
 

@@ -413,7 +413,7 @@ def test_groups_and_chunks_hold_every_scenario_once_and_agree_in_shape():
             assert scenario.model_point in group.points
 
 
-def test_what_else_needs_a_compilation_of_its_own_parts_groups():
+def test_limits_part_groups_and_steps_do_not():
     no_limits = {
         n: {c: s * float("inf") for c in ("gas_rate", "oil_rate")}
         for n, s in (("cv_low", -1), ("cv_high", 1))
@@ -421,9 +421,14 @@ def test_what_else_needs_a_compilation_of_its_own_parts_groups():
     made = expand({"tuning": no_limits}, [axis("tuning.cv_high.gas_rate", 1e4, float("inf"))])
     assert [group.has_limits for group in made.groups] == [True, False]
     made = expand(axes=[axis("tuning.move_high.choke", 2, 4)])
-    assert [group.whole_steps for group in made.groups] == [1, 2]
+    assert len(made.groups) == 1
     made = expand({"controller": "continuous"}, [axis("tuning.move_high.choke", 2, 4)])
-    assert [group.whole_steps for group in made.groups] == [0]
+    assert len(made.groups) == 1
+
+
+def test_groups_of_one_size_share_their_program():
+    made = expand({"reference": "quick"}, [axis("blocking", "moves", "inputs")])
+    assert (len(made.groups), made.describe().compilations) == (2, 1)
 
 
 @pytest.mark.parametrize("name", [name for name in shipped_studies() if name != "tune"])

@@ -6,9 +6,8 @@ import time
 
 import pytest
 
-from jaxmpc.programs import compilation
-from studies.definition import estimate
-from studies.definition.estimate import COMPILE_SECONDS, MODEL_SECONDS, Pace, Work, chunk_seconds, readable
+from jaxmpc.programs.clock import _heard
+from studies.definition.estimate import MODEL_SECONDS, Pace, Work, chunk_seconds, readable
 from studies.definition.sweep import StudyDefinition
 from studies.load import expand
 from studies.run import comparison
@@ -24,33 +23,27 @@ WORK = Work(
 )
 
 
-def took(seconds, process=1):
-    return {"wall_time": seconds, "host": "here", "process": process}
+def took(seconds):
+    return {"wall_time": seconds, "host": "here", "process": 1}
 
 
 def test_before_the_first_chunk_the_table_decides():
     assert WORK.costs({}) == [5, 10, 40]
-    assert WORK.rest({}) == 2 * 5 + 3 * 10 + 40 + 3 * COMPILE_SECONDS
+    assert WORK.rest({}) == 2 * 5 + 3 * 10 + 40
 
 
-def test_a_group_is_judged_by_its_own_chunks_without_those_that_compiled():
-    done = {0: took(30), 1: took(6), 2: took(90), 3: took(50, process=2), 4: took(70)}
+def test_a_group_is_judged_by_its_own_chunks():
+    done = {0: took(8), 1: took(6), 2: took(90), 3: took(50), 4: took(70)}
     continuous, integer, _ = WORK.costs(done)
-    assert continuous == 6
-    assert integer == 70  # the first ones of both processes compiled
-
-
-def test_a_first_chunk_counts_without_its_compilation_but_not_for_less_than_the_table_says():
-    assert WORK.costs({0: took(60)})[0] == 60 - COMPILE_SECONDS
-    assert WORK.costs({0: took(COMPILE_SECONDS + 1)})[0] == 5
-    assert WORK.costs({0: took(2)})[0] == 2  # nothing was compiled
+    assert continuous == 7
+    assert integer == 70
 
 
 def test_a_group_without_chunks_goes_by_groups_of_its_kind():
-    measured = {0: took(5), 1: took(5), 2: took(90), 3: took(30)}
+    measured = {0: took(5), 1: took(5), 2: took(30), 3: took(30)}
     assert WORK.costs(measured)[2] == 3 * 40
     speed_of_the_machine = 2
-    assert WORK.costs({0: took(10 + COMPILE_SECONDS)})[2] == speed_of_the_machine * 40
+    assert WORK.costs({0: took(10)})[2] == speed_of_the_machine * 40
 
 
 def test_chunks_that_were_taken_over_are_done_but_measure_nothing():
@@ -60,8 +53,8 @@ def test_chunks_that_were_taken_over_are_done_but_measure_nothing():
 
 
 def test_the_rest_is_what_the_missing_chunks_cost():
-    done = {0: took(25), 1: took(5), 2: took(30), 3: took(20)}
-    assert WORK.rest(done) == 20 + (2 * 40 + COMPILE_SECONDS)
+    done = {0: took(5), 1: took(5), 2: took(20), 3: took(20)}
+    assert WORK.rest(done) == 20 + 2 * 40
     assert WORK.rest(dict.fromkeys(range(6), took(1))) == 0
 
 
@@ -73,7 +66,7 @@ def test_the_time_left_of_a_run_counts_workers_that_run_at_once(workers):
     now[0] = 60 / workers
     pace.add(2, took(30))
     pace.add(3, took(30))
-    assert pace.left == pytest.approx((30 + 3 * 40 + COMPILE_SECONDS) / workers)
+    assert pace.left == pytest.approx((30 + 3 * 40) / workers)
 
 
 def test_a_bar_shows_the_time_left_by_group_and_what_the_run_adds(capsys, monkeypatch):
@@ -85,19 +78,16 @@ def test_a_bar_shows_the_time_left_by_group_and_what_the_run_adds(capsys, monkey
     assert re.search(r"6/12 scenarios \[.*about 10\.0 min left, .* per second, 3 on the front\]", last)
 
 
-def test_bars_do_not_count_the_time_in_which_something_is_compiled(capsys, monkeypatch):
-    passed = [100.0]
-    monkeypatch.setattr(compilation, "_compilation", known := compilation.Compilation())
-    monkeypatch.setattr(known, "seconds", lambda: passed[0])
+def test_bars_do_not_count_the_time_in_which_something_is_compiled(capsys):
     with progress_bar("wear", 12, 0, WORK, {}, show=True) as bar:
         time.sleep(0.2)
-        passed[0] += 0.2
+        _heard("/jax/core/compile/backend_compile_duration", 0.2)
         bar.add(0, took(5), 2)
     (rate,) = set(re.findall(r"([\d.e+]+) per second", capsys.readouterr().err))
     assert float(rate) > 2 / 0.2
     with comparison.progress_bar("runs", True) as report:
         time.sleep(2.0)
-        passed[0] += 2.0
+        _heard("/jax/core/compile/backend_compile_duration", 2.0)
         report(1, 100)
     last = capsys.readouterr().err.rpartition("\r")[2]
     assert re.search(r"1/100 \[00:0[01]<", last), last
@@ -119,14 +109,13 @@ def test_a_dry_run_adds_identification_and_what_the_table_says_of_every_group():
     assert [len(group.scenarios) for group in study.groups] == [4, 1]
     assert [study.lanes(group) for group in (0, 1)] == [3, 1]
     continuous, integer = chunk_seconds("continuous", 30, 3), chunk_seconds("mixed-integer", 30, 1)
-    wanted = MODEL_SECONDS + 2 * continuous + integer + 2 * COMPILE_SECONDS
+    wanted = MODEL_SECONDS + 2 * continuous + integer
     assert study.describe().seconds == pytest.approx(wanted)
 
 
-def test_status_estimates_the_rest_by_group_from_what_the_store_says_of_its_chunks(tmp_path, monkeypatch):
+def test_status_estimates_the_rest_by_group_from_what_the_store_says_of_its_chunks(tmp_path):
     study = expand(StudyDefinition.from_dict(BODY))
     assert study_layout(study).provenance["work"]["groups"] == [0, 0, 0]
-    monkeypatch.setattr(estimate, "COMPILE_SECONDS", 0.0)
     values = numbers(24)
     path = write(tmp_path / "a.zarr", [WEIGHT], grid(list(range(24))), values, skip=(1, 2))
     assert "for the rest" not in str(status(path))  # a store without the table of its chunks

@@ -5,7 +5,7 @@ import tomllib
 import tracemalloc
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from jaxmpc.errors import InputError
@@ -131,6 +131,7 @@ def test_a_changed_definition_is_taken_or_refused_and_writes_nothing(body, quick
 
 
 @QUIETLY
+@example(body="\ud800")
 @given(body=THINGS)
 def test_anything_in_place_of_a_definition_is_refused(body):
     assert isinstance(taken_or_refused(lambda: expand(StudyDefinition.from_dict(body))), InputError)

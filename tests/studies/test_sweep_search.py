@@ -206,14 +206,6 @@ REFUSED = {
         "axes[1]",
         "compiled program",
     ),
-    "moves of one or more whole steps": (
-        {
-            "base": {"controller": "mixed-integer", "actuator": "step"},
-            "axes": [drawn("tuning.move_high.choke", 2, 7)],
-        },
-        "axes[0]",
-        "whole steps",
-    ),
     "a model for every number": ({"axes": [drawn("model.choke", 20, 60)]}, "axes[0].distribution", "values"),
     "limits that cross in a corner": (
         {"axes": [drawn("tuning.mv_low.choke", 0, 60), drawn("tuning.mv_high.choke", 50, 100)]},

@@ -21,8 +21,9 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from jaxmpc.check import as_floats
 from jaxmpc.errors import InputError
-from jaxmpc.files import write_atomically
+from jaxmpc.files import read_json, write_atomically
 
 GRAVITY = 9.81  # m/s2
 GAS_CONSTANT = 8.314462618  # J/(mol K)
@@ -79,76 +80,42 @@ class WellParameters(eqx.Module):
 
     The defaults are the shipped well, fitted to published step responses at 50 % choke and 7500 m3/h lift.
     Lengths, volumes and depths are effective values.
-
-    Attributes:
-        tubing_length: from the gas-lift valve to the wellhead [m].
-        tubing_diameter: inner diameter [m].
-        annulus_volume: [m3].
-        perforation_depth: of the perforations below the gas-lift valve [m].
-        liquid_density: [kg/m3].
-        molar_mass: of the gas [kg/mol].
-        tubing_temperature: [K].
-        annulus_temperature: [K].
-        reservoir_pressure: [Pa].
-        productivity: inflow per pressure difference [kg/s/Pa].
-        near_well_resistance: share of the drawdown that the near-well zone takes [1].
-        near_well_time: time constant of the near-well pressure [s].
-        gas_oil_ratio: of the inflow, gas at standard conditions per liquid [m3/m3].
-        choke_conductance: of the fully open choke [m2].
-        choke_linear: first shape coefficient of the choke characteristic [1].
-        choke_quick: shape coefficient of its quick opening [1].
-        manifold_pressure: downstream of the choke [Pa].
-        friction_factor: Darcy factor of the tubing [1].
-        injection_conductance: of the gas-lift valve [m2].
-        supply_pressure: annulus pressure scale of the lift supply [Pa].
-        supply_droop: how far the annulus pressure rises before the supply gives way [Pa].
-        supply_limit: discharge pressure of the supply [Pa].
-        slip_base: gas-to-liquid velocity ratio at high flow [1].
-        slip_velocity: drift velocity, which raises the ratio at low flow [m/s].
-        slip_floor: flow velocity at which that rise levels off [m/s].
-        choke_time: time constant of the choke [s].
-        lift_time: time constant of the lift rate [s].
-        root_width: pressure difference below which valves and tubing flow less than the square root [Pa].
-        gas_meter: ratio of measured to true gas rate [1].
-        live_oil_share: gas share of a section below which dissolved gas softens its pressure [1].
-        equalising_rate: fastest rate at which the two sections equalise their pressures [1/s].
-        trip_start: annulus pressure from which the supply is throttled back [Pa].
-        trip_end: annulus pressure at which it is shut [Pa].
     """
 
-    tubing_length: Any = 908.867
-    tubing_diameter: Any = 0.195001
-    annulus_volume: Any = 12.8651
-    perforation_depth: Any = 52.2201
-    liquid_density: Any = 820.0
-    molar_mass: Any = 0.020
-    tubing_temperature: Any = 350.0
-    annulus_temperature: Any = 340.0
-    reservoir_pressure: Any = 78.2901e5
-    productivity: Any = 2.01723e-5
-    near_well_resistance: Any = 0.550781
-    near_well_time: Any = 578.897
-    gas_oil_ratio: Any = 26.0494
-    choke_conductance: Any = 0.0251143
-    choke_linear: Any = -0.866551
-    choke_quick: Any = 0.990681
-    manifold_pressure: Any = 13.37e5
-    friction_factor: Any = 0.0181771
-    injection_conductance: Any = 7.19577e-4
-    supply_pressure: Any = 67.6273e5
-    supply_droop: Any = 26.5168e5
-    supply_limit: Any = 150e5
-    slip_base: Any = 0.700001
-    slip_velocity: Any = 4.13283
-    slip_floor: Any = 1.21735
-    choke_time: Any = 17.6966
-    lift_time: Any = 47.222
+    tubing_length: Any = 908.867  # from the gas-lift valve to the wellhead [m]
+    tubing_diameter: Any = 0.195001  # inner diameter [m]
+    annulus_volume: Any = 12.8651  # [m3]
+    perforation_depth: Any = 52.2201  # of the perforations below the gas-lift valve [m]
+    liquid_density: Any = 820.0  # [kg/m3]
+    molar_mass: Any = 0.020  # of the gas [kg/mol]
+    tubing_temperature: Any = 350.0  # [K]
+    annulus_temperature: Any = 340.0  # [K]
+    reservoir_pressure: Any = 78.2901e5  # [Pa]
+    productivity: Any = 2.01723e-5  # inflow per pressure difference [kg/s/Pa]
+    near_well_resistance: Any = 0.550781  # share of the drawdown that the near-well zone takes [1]
+    near_well_time: Any = 578.897  # time constant of the near-well pressure [s]
+    gas_oil_ratio: Any = 26.0494  # of the inflow, gas at standard conditions per liquid [m3/m3]
+    choke_conductance: Any = 0.0251143  # of the fully open choke [m2]
+    choke_linear: Any = -0.866551  # first shape coefficient of the choke characteristic [1]
+    choke_quick: Any = 0.990681  # shape coefficient of its quick opening [1]
+    manifold_pressure: Any = 13.37e5  # downstream of the choke [Pa]
+    friction_factor: Any = 0.0181771  # Darcy factor of the tubing [1]
+    injection_conductance: Any = 7.19577e-4  # of the gas-lift valve [m2]
+    supply_pressure: Any = 67.6273e5  # annulus pressure scale of the lift supply [Pa]
+    supply_droop: Any = 26.5168e5  # how far the annulus pressure rises before the supply gives way [Pa]
+    supply_limit: Any = 150e5  # discharge pressure of the supply [Pa]
+    slip_base: Any = 0.700001  # gas-to-liquid velocity ratio at high flow [1]
+    slip_velocity: Any = 4.13283  # drift velocity, which raises the ratio at low flow [m/s]
+    slip_floor: Any = 1.21735  # flow velocity at which that rise levels off [m/s]
+    choke_time: Any = 17.6966  # time constant of the choke [s]
+    lift_time: Any = 47.222  # time constant of the lift rate [s]
+    # pressure difference below which valves and tubing flow less than the square root [Pa]
     root_width: Any = 5e4
-    gas_meter: Any = 0.894551
-    live_oil_share: Any = 0.3
-    equalising_rate: Any = 2.0
-    trip_start: Any = 70e5
-    trip_end: Any = 80e5
+    gas_meter: Any = 0.894551  # ratio of measured to true gas rate [1]
+    live_oil_share: Any = 0.3  # gas share of a section below which dissolved gas softens its pressure [1]
+    equalising_rate: Any = 2.0  # fastest rate at which the two sections equalise their pressures [1/s]
+    trip_start: Any = 70e5  # annulus pressure from which the supply is throttled back [Pa]
+    trip_end: Any = 80e5  # annulus pressure at which it is shut [Pa]
 
 
 def model(ops, x: Sequence, u: Sequence, p) -> tuple[list, list]:
@@ -282,19 +249,12 @@ def model(ops, x: Sequence, u: Sequence, p) -> tuple[list, list]:
 def check_parameters(parameters: WellParameters, path: str = "well") -> WellParameters:
     """Refuse parameters that are not finite or have no physical meaning.
 
-    Args:
-        parameters: numbers or arrays (a batch of wells).
-        path: prefix of the field names in errors.
-
     Raises:
         InputError: naming the first field that is wrong and its unit.
     """
     signed = {"choke_linear", "choke_quick", "perforation_depth"}
     for field in fields(parameters):
-        try:
-            value = np.asarray(getattr(parameters, field.name), dtype=np.float64)
-        except (TypeError, ValueError):
-            raise InputError(f"{path}.{field.name}", getattr(parameters, field.name), "a number") from None
+        value = as_floats(f"{path}.{field.name}", getattr(parameters, field.name), "a number")
         if not np.isfinite(value).all() or (field.name not in signed and not (value > 0).all()):
             kind = "finite" if field.name in signed else "finite and positive"
             raise InputError(f"{path}.{field.name}", value.tolist(), f"a {kind} number (SI units)")
@@ -329,10 +289,7 @@ def parameters_to_dict(parameters: WellParameters) -> dict[str, float]:
 
 def load_parameters(path: str | Path) -> WellParameters:
     """Read parameters written by `save_parameters`. Raises `InputError` naming the field that is wrong."""
-    try:
-        body = json.loads(Path(path).read_text())
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError("parameter file", str(path), f"a readable JSON file ({error})") from error
+    body = read_json("parameter file", path)
     return parameters_from_dict(body.get("parameters", body) if isinstance(body, dict) else body)
 
 

@@ -16,11 +16,7 @@ from jaxmpc.programs.packing import Packing
 
 
 class HostWell:
-    """A well that keeps its state.
-
-    Args:
-        plant: its parameters and actuator.
-    """
+    """A well that keeps its state."""
 
     def __init__(self, plant: WellPlant):
         self.plant, self.dt = plant, plant.dt

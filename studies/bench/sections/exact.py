@@ -34,9 +34,7 @@ def exact(context: Context) -> Iterator[Row]:
         name = f"exact MIQP, {mode}"
         context.say(name)
         instances = context.recordings.instances("mixed-integer", mode, context.size.exact)
-        contest = Contest(
-            context, "exact", name, instances.cases(), context.miqp_peers, 1e-7, _polished, in_time=True
-        )
+        contest = Contest(context, name, instances.cases(), context.miqp_peers, 1e-7, _polished, in_time=True)
         _enter_ours(contest, mode, instances)
         contest.ask_peers()
         for finish, label in WAYS.items():
@@ -48,7 +46,7 @@ def exact(context: Context) -> Iterator[Row]:
         yield from contest.peer_rows()
         context.say(f"{name}: longest solves")
         hardest = context.recordings.instances("mixed-integer", mode, context.size.hardest, hardest=True)
-        contest = Contest(context, "exact", f"{name}, longest solves", hardest.cases())
+        contest = Contest(context, f"{name}, longest solves", hardest.cases())
         _enter_ours(contest, mode, hardest)
         note = f"the {len(hardest)} samples of the run that took longest; the ways to finish check each other"
         for finish, label in WAYS.items():

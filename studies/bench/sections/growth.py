@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -14,11 +15,17 @@ from studies.bench.context import Context
 from studies.bench.instances import Instances, Problems
 from studies.bench.judge import Judge
 from studies.bench.lanes import Lanes
-from studies.bench.rows import Row, batched
+from studies.bench.rows import Row, whole
 from studies.bench.sections.relaxed import TOLERANCE, batch_times
 
 LANES = 32
-THESIS_LIKE = {"horizon": 250, "blocks": 16, "CVs": 2, "MVs": 2}
+WEIGHTS: dict[str, Any] = dict(
+    cv_weight=1.0, soft_quadratic=1.0, soft_linear=0.5, deadzone=0.5, slack_weight=100.0, move_weight=20.0
+)
+LIMITS: dict[str, Any] = dict(
+    cv_low=-6.0, cv_high=6.0, mv_low=-10.0, mv_high=10.0, move_low=-1.0, move_high=1.0
+)
+THESIS_LIKE = {"horizon": 250, "blocks": 16, "CVs": 2, "MVs": 2}  # horizon [samples]
 
 
 def growth(context: Context) -> Iterator[Row]:
@@ -38,17 +45,11 @@ def growth(context: Context) -> Iterator[Row]:
                 judge.hear(peer.name, plans)
                 ratio = float(theirs.sum()) / seconds
             name, errors, to = f"growth, {axis} {size}", judge.errors("jaxmpc"), f"{peer.name} (one core)"
-            yield batched(name, "growth", seconds, LANES, errors, ratio=ratio, ratio_to=to, note=note)
+            yield whole(name, seconds, errors, LANES, ratio=ratio, ratio_to=to, note=note)
 
 
 def random_instances(rng: np.random.Generator, shape: dict[str, int], lanes: int) -> Instances:
-    """Problems of a random stable model of first-order responses, away from their setpoints by several deadzones.
-
-    Args:
-        rng: names the model and the problems.
-        shape: ``horizon`` [samples], ``blocks``, ``CVs``, ``MVs``.
-        lanes: problems.
-    """
+    """Problems of a random stable model of first-order responses, away from their setpoints by several deadzones."""
     horizon, blocks, cvs, mvs = (shape[key] for key in THESIS_LIKE)
     control = int(0.8 * horizon)
     structure = Structure(
@@ -58,21 +59,7 @@ def random_instances(rng: np.random.Generator, shape: dict[str, int], lanes: int
         control_horizon=control,
         blocks=growing_blocks(control, blocks),
     )
-    tuning = make_tuning(
-        structure,
-        cv_weight=1.0,
-        soft_quadratic=1.0,
-        soft_linear=0.5,
-        deadzone=0.5,
-        cv_low=-6.0,
-        cv_high=6.0,
-        slack_weight=100.0,
-        move_weight=20.0,
-        mv_low=-10.0,
-        mv_high=10.0,
-        move_low=-1.0,
-        move_high=1.0,
-    )
+    tuning = make_tuning(structure, **WEIGHTS, **LIMITS)
     t = np.arange(1, horizon + 1)
     gain = rng.choice([-1.0, 1.0], (cvs, mvs)) * rng.uniform(0.3, 1.5, (cvs, mvs))
     slow = rng.uniform(0.03, 0.2, (cvs, mvs)) * horizon  # samples

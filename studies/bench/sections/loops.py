@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -15,6 +13,7 @@ from jaxmpc.problem.tuning import Tuning
 from jaxmpc.process.plant import WellPlant
 from studies.bench.context import Context
 from studies.bench.instances import Kind, Mode, Recording, make_controller
+from studies.bench.judge import taken
 from studies.bench.rows import Goal, Row, timed, whole
 from studies.definition import presets, references
 
@@ -42,7 +41,7 @@ def loops(context: Context) -> Iterator[Row]:
 
 def _run_row(how: str, run: Recording, context: Context, kind: Kind, mode: Mode) -> Row:
     wrong = np.where(run.fallback, np.nan, np.maximum(run.gap, broken_limits(run, kind, mode, context)))
-    row = timed(f"{kind} run, {mode}, {how}", "loop", run.solve_time, wrong)
+    row = timed(f"{kind} run, {mode}, {how}", run.solve_time, wrong)
     row.counts = row.counts and not run.fallback.any()
     row.rate, row.seconds = len(run.cv) / run.wall_time, run.wall_time
     row.note = (
@@ -74,42 +73,26 @@ def variants(context: Context, integer: bool) -> Row:
     size, mode = context.size, context.size.modes[0]
     structure = presets.structure(mode, integer=integer)
     if integer:
-        kind, count, samples, reference = (
-            "mixed-integer",
-            size.together,
-            size.together_samples,
-            size.together_reference(),
-        )
-        goal = Goal("rate", 800.0, 5000.0)
+        kind, count, samples, goal = "mixed-integer", size.together, size.together_samples, (800.0, 5000.0)
     else:
-        kind, count, samples, reference = (
-            "continuous",
-            size.variants,
-            size.variant_samples,
-            references.quick(),
-        )
-        goal = Goal("rate", 4000.0, 20000.0)
+        kind, count, samples, goal = "continuous", size.variants, size.variant_samples, (4000.0, 20000.0)
+    reference = (size.together_reference if integer else references.quick)()
     controllers = Controllers(structure, _tunings(structure, count), context.model)
     context.say(f"{count} {kind} variants, {samples} samples")
-    run = functools.partial(
-        simulate_batch, controllers, WellPlant(actuator="step"), reference, samples=samples
-    )
+    run = lambda: simulate_batch(controllers, WellPlant(actuator="step"), reference, samples=samples)  # noqa: E731
     run()  # compiles, what searches on the host need as well
-    begin = time.perf_counter()
-    runs = run()
-    elapsed = time.perf_counter() - begin
+    elapsed, runs = taken(run)
     return whole(
         f"{kind} variants together, {mode}: {count}",
-        "loop",
         elapsed,
         np.concatenate([np.where(run.fallback, np.inf, run.gap) for run in runs]),
         rate=count * samples / elapsed,
-        goals=(goal,),
+        goals=(Goal("rate", *goal),),
         note=f"variant-samples per second over {samples} samples, plant included, compiled before; the error is the gap",
     )
 
 
 def _tunings(structure: Structure, count: int) -> list[Tuning]:
-    weights = np.geomspace(60.0, 2000.0, count)  # 1/(%)^2
-    changes = [{"move_weight": {presets.CHOKE: float(w), presets.LIFT: 0.2}} for w in weights]
+    weights = np.geomspace(60.0, 2000.0, count).tolist()  # 1/(%)^2
+    changes = ({"move_weight": {presets.CHOKE: weight, presets.LIFT: 0.2}} for weight in weights)
     return [presets.tuning(structure, changes=change) for change in changes]

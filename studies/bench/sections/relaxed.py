@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator
 
 import jax
@@ -12,7 +11,7 @@ from studies.bench.beside import Contest, ask
 from studies.bench.context import Context
 from studies.bench.judge import Judge, taken, time_each
 from studies.bench.lanes import Lanes
-from studies.bench.rows import Goal, Row, batched
+from studies.bench.rows import Goal, Row, whole
 
 TOLERANCE = 1e-8  # that the peers are asked for
 FLOOR_BATCH = 512
@@ -25,7 +24,7 @@ def one_at_a_time(context: Context) -> Iterator[Row]:
         name = f"relaxed QP, {mode}"
         context.say(name)
         instances = context.recordings.instances("continuous", mode, context.size.relaxed)
-        contest = Contest(context, "relaxed", name, instances.cases(), context.qp_peers, TOLERANCE)
+        contest = Contest(context, name, instances.cases(), context.qp_peers, TOLERANCE)
         lanes = Lanes(instances)
         for start in STARTS:
             singles = lanes.singles(getattr(lanes, start))
@@ -60,12 +59,11 @@ def batches(context: Context) -> Iterator[Row]:
                 times, errors = batch_times(lanes, judge, f"{count} {start}", start, count, repeats)
                 seconds = float(np.median(times))
                 rates[start].append(count / seconds)
-                yield batched(
+                yield whole(
                     f"batch of {count}, {mode}, {start}",
-                    "batch",
                     seconds,
-                    count,
                     errors,
+                    count,
                     ratio=None if rate_of_peer is None else count / seconds / rate_of_peer,
                     ratio_to=f"{peer.name} (one core)",
                     goals=(Goal("ratio", 60.0, 150.0),) if count == FLOOR_BATCH else (),
@@ -79,19 +77,10 @@ def batches(context: Context) -> Iterator[Row]:
 def batch_times(
     lanes: Lanes, judge: Judge, who: str, start: str, count: int, repeats: int
 ) -> tuple[list[float], np.ndarray]:
-    """Seconds of every repeated call for a batch, and the errors of its distinct problems.
-
-    Args:
-        lanes: the problems.
-        judge: of them; hears the plans.
-        who: name of the plans there.
-        start: one of `STARTS`.
-        count: size of the batch.
-        repeats: calls.
-    """
+    """Seconds of every repeated call for a batch, and the errors of its distinct problems, whose plans the judge hears."""
     batch = lanes.batch(getattr(lanes, start), count)
     solution = lanes.solve_batch(batch)  # compiles
-    times = [taken(functools.partial(lanes.solve_batch, batch))[0] for _ in range(repeats)]
+    times = [taken(lambda: lanes.solve_batch(batch))[0] for _ in range(repeats)]
     distinct = min(count, len(judge.cases))
     judge.hear(who, lanes.plans(solution.x[:distinct]))
     errors = judge.errors(who)
@@ -105,7 +94,7 @@ def devices(context: Context) -> Iterator[Row]:
     count, mode = 4096, context.size.modes[0]
     if jax.default_backend() == "cpu":
         name, note = f"GPU against CPU, batch of {count}", "JAX sees no accelerator on this machine"
-        yield Row(name=name, section="gpu", status="not measured", note=note)
+        yield Row(name=name, status="not measured", note=note)
         return
     instances = context.recordings.instances("continuous", mode, context.size.lanes)
     judge = Judge(instances.cases())
@@ -117,4 +106,4 @@ def devices(context: Context) -> Iterator[Row]:
         seconds[device.platform] = min(times)
     for platform, own in seconds.items():
         name, errors = f"batch of {count}, {mode}, cold, on {platform}", judge.errors(platform)
-        yield batched(name, "gpu", own, count, errors, ratio=seconds["cpu"] / own, ratio_to="the CPU")
+        yield whole(name, own, errors, count, ratio=seconds["cpu"] / own, ratio_to="the CPU")

@@ -28,11 +28,8 @@ def startup(context: Context) -> Iterator[Row]:
         instances = context.recordings.instances("mixed-integer", mode, 5)
         cases = instances.cases()
         # a case file has no limits of the first move alone
-        free = [
-            i
-            for i, case in enumerate(cases)
-            if not np.isfinite(case["first_move_high"] + case["first_move_low"]).any()
-        ]
+        held = [np.isfinite(case["first_move_high"] + case["first_move_low"]).any() for case in cases]
+        free = np.flatnonzero(~np.array(held)).tolist()
         i = free[len(free) // 2]
         case = {key: value for key, value in cases[i].items() if not key.startswith("first_move")}
         judge = Judge([case])
@@ -47,7 +44,6 @@ def startup(context: Context) -> Iterator[Row]:
                 judge.hear(call, [plan])
                 yield whole(
                     f"{call} call, {mode}",
-                    "startup",
                     seconds,
                     judge.errors(call),
                     goals=(Goal("seconds", 30.0, 8.0),) if call == "first" else (),

@@ -47,19 +47,13 @@ def _overhead(context: Context, folder: Path, chunks: int, samples: int) -> Row:
     study = _study(chunks, samples)
     elapsed, path = taken(lambda: run_study(study, folder / "overhead.zarr", **QUIET))
     simulated = sum(facts["simulation_time"] for facts in chunk_facts(path).values())
-    frame = kpi_frame(path)
-    solved, rest = int(np.asarray(frame["complete"]).sum()), elapsed - simulated
-    return Row(
-        name=f"sweep: all but the closed loops, {chunks} chunks of {CHUNK}",
-        section="sweep",
-        instances=len(frame),
-        solved=solved,
-        seconds=rest,
-        goals=(Goal("seconds", SHARE * simulated),),
-        counts=solved == len(frame),
-        note=f"runner, key figures and store in {elapsed:.1f} s, of which {simulated:.1f} s are closed loops: "
-        f"{100 * rest / simulated:.1f} %; the floor is {100 * SHARE:.0f} %, compiled before",
+    frame, rest = kpi_frame(path), elapsed - simulated
+    row = _row(f"all but the closed loops, {chunks} chunks of {CHUNK}", rest, len(frame), SHARE * simulated)
+    row.note = (
+        f"runner, key figures and store in {elapsed:.1f} s, of which {simulated:.1f} s are closed loops: "
+        f"{100 * rest / simulated:.1f} %; the floor is {100 * SHARE:.0f} %, compiled before"
     )
+    return _counted(row, np.asarray(frame["complete"]).sum())
 
 
 def _opening(context: Context, folder: Path, count: int) -> Row:
@@ -68,30 +62,32 @@ def _opening(context: Context, folder: Path, count: int) -> Row:
     with _made_up(folder / "opening.zarr", layout, len(layout.chunk_scenarios)) as store:
         path = store.path
     seconds, frame = taken(lambda: kpi_frame(path))
-    solved = int((np.asarray(frame["choke_travel"]) == np.arange(count)).sum())
-    return Row(
-        name=f"sweep: key figures of {count} scenarios as a table",
-        section="sweep",
-        instances=count,
-        solved=solved,
-        seconds=seconds,
-        goals=(Goal("seconds", 2.0),) if count >= 10_000 else (),
-        counts=solved == count,
+    row = _row(
+        f"key figures of {count} scenarios as a table", seconds, count, 2.0 if count >= 10_000 else None
     )
+    return _counted(row, (np.asarray(frame["choke_travel"]) == np.arange(count)).sum())
 
 
 def _resuming(context: Context, folder: Path, chunks: int) -> Row:
     context.say(f"what is missing of {chunks} chunks")
     with _made_up(folder / "resuming.zarr", _layout(chunks * 2, 2), chunks - 1) as store:
         seconds, missing = taken(store.pending)
-    return Row(
-        name=f"sweep: what is missing of {chunks} chunks",
-        section="sweep",
-        instances=chunks,
-        seconds=seconds,
-        goals=(Goal("seconds", 1.0),) if chunks >= 1000 else (),
-        counts=missing == [chunks - 1],
-    )
+    row = _row(f"what is missing of {chunks} chunks", seconds, chunks, 1.0 if chunks >= 1000 else None)
+    row.counts = missing == [chunks - 1]
+    return row
+
+
+def _row(what: str, seconds: float, instances: int, most: float | None) -> Row:
+    """A row of the seconds of a whole, which may be so many."""
+    goals = () if most is None else (Goal("seconds", most),)
+    return Row(name=f"sweep: {what}", instances=instances, seconds=seconds, goals=goals)
+
+
+def _counted(row: Row, right: Any) -> Row:
+    """The row with how many of its instances came out right, which all have to."""
+    row.solved = int(right)
+    row.counts = row.solved == row.instances
+    return row
 
 
 def _memory(context: Context, folder: Path, chunks: tuple[int, int]) -> Iterator[Row]:
@@ -100,8 +96,7 @@ def _memory(context: Context, folder: Path, chunks: tuple[int, int]) -> Iterator
         context.say(f"peak memory of {count * CHUNK} scenarios")
         command = [sys.executable, "-m", __name__, str(count), str(folder / f"memory-{count}.zarr")]
         done = subprocess.run(command, check=False, capture_output=True, text=True)
-        row = Row(name=f"sweep: peak memory of {count * CHUNK} scenarios", section="sweep")
-        row.instances = count * CHUNK
+        row = Row(name=f"sweep: peak memory of {count * CHUNK} scenarios", instances=count * CHUNK)
         if done.returncode:
             row.status, row.counts, row.note = "failed", False, " ".join(done.stderr.split())[-200:]
         else:
@@ -144,22 +139,17 @@ def _layout(count: int, size: int) -> StoreLayout:
     )
 
 
-def _fields(layout: StoreLayout, chunk: int) -> dict[str, Any]:
-    numbers = layout.chunk_scenarios[chunk].astype(float)
-    fields = {}
-    for variable in layout.variables:
-        shape = layout.shape(variable)
-        wide = np.broadcast_to(numbers.reshape(-1, *[1] * len(shape)), (len(numbers), *shape))
-        fields[variable.name] = wide.astype(variable.dtype)
-    return fields
-
-
 @contextlib.contextmanager
 def _made_up(path: Path, layout: StoreLayout, chunks: int) -> Iterator[Store]:
-    """A store with its first chunks filled."""
+    """A store with its first chunks filled: every number is that of its scenario."""
     with Store.begin(path, layout, say=lambda _: None) as store:
-        for i in range(chunks):
-            store.commit(i, _fields(layout, i), {})
+        for i, numbers in enumerate(layout.chunk_scenarios[:chunks]):
+            fields = {}
+            for variable in layout.variables:
+                shape = layout.shape(variable)
+                wide = np.broadcast_to(numbers.reshape(-1, *[1] * len(shape)), (len(numbers), *shape))
+                fields[variable.name] = wide.astype(variable.dtype)
+            store.commit(i, fields, {})
         yield store
 
 

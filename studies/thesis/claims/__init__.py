@@ -48,19 +48,14 @@ ROWS = _rows()
 
 
 def judge(row: Row, evidence: Evidence | None) -> Claim:
-    """Measure one row; without its runs it is not tested.
-
-    Args:
-        row: the statement.
-        evidence: results of its study, None if there are none.
-    """
+    """Measure one row on the results of its study; without its runs it is not tested."""
     missing = [name for name in row.needs if evidence is None or name not in evidence.roles]
     if evidence is None or missing:
         nothing = Finding((), {}, instead=f"no finished run of {', '.join(missing) or row.study}")
         return claim_of(row, nothing)
     module, _, name = row.measure.partition(".")
     measures = next(known for known in MEASURES if known.__name__.endswith(f".{module}"))
-    return claim_of(row, getattr(measures, name)(evidence, *row.needs))
+    return claim_of(row, getattr(measures, name)(evidence, *map(evidence.run, row.needs)))
 
 
 def claims(data: xr.Dataset, figures: xr.Dataset | None = None) -> list[Claim]:
@@ -72,6 +67,6 @@ def claims(data: xr.Dataset, figures: xr.Dataset | None = None) -> list[Claim]:
         data: results of the thesis study.
         figures: from `key_figures`, if already there.
     """
-    evidence = Evidence.of(data, given=figures)
-    rows = sorted((row for row in ROWS if row.id in SUMMARY), key=lambda row: SUMMARY.index(row.id))
+    evidence, known = Evidence.of(data, given=figures), {row.id: row for row in ROWS}
+    rows = (known[name] for name in SUMMARY)
     return [judge(row, evidence) for row in rows if set(row.needs) <= set(evidence.roles)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from studies.definition.presets import CHOKE
-from studies.thesis.claims.record import Evidence, Finding
+from studies.thesis.claims.record import Evidence, Finding, Run
 
 
 def staircase(evidence: Evidence) -> Finding:
@@ -33,18 +33,16 @@ def mean_move(evidence: Evidence) -> Finding:
     return Finding(tuple(below), {"means": _means(evidence), "limit": limit.max(), "step": step.max()})
 
 
-def follows(evidence: Evidence, role: str) -> Finding:
+def follows(evidence: Evidence, run: Run) -> Finding:
     """Demands are whole steps, and the choke is where it is told to be."""
-    run = evidence.run(role)
     demand, position, move = (run[name].sel(mv=CHOKE).values for name in ("demand", "position", "move"))
     steps = (demand - (demand[0] - move[0])) / run.tuning_move_high.sel(mv=CHOKE).item()
     fraction, behind = np.abs(steps - np.round(steps)).max(), np.abs(demand - position).max()
     return Finding((fraction < 1e-6, behind < 1e-6), {"fraction": fraction, "behind": behind})
 
 
-def no_reversal_at_once(evidence: Evidence, role: str) -> Finding:
+def no_reversal_at_once(evidence: Evidence, run: Run) -> Finding:
     """No move is taken back in the next sample."""
-    run = evidence.run(role)
     move = run.move.sel(mv=CHOKE).values
     at_once = (move[1:] * move[:-1] < -1e-9).sum()
     moved = np.flatnonzero(np.abs(move) > 1e-9)

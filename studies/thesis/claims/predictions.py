@@ -3,34 +3,32 @@
 from __future__ import annotations
 
 import numpy as np
-import xarray as xr
 
 from studies.definition.presets import CHOKE, GAS, LIFT, OIL
 from studies.thesis.claims.limits import FIRST, PLAN_ALIKE, STATIONARY
-from studies.thesis.claims.record import Evidence, Finding, index, late_deviation
+from studies.thesis.claims.record import Evidence, Finding, Run, index, late_deviation, name_of
 from studies.thesis.claims.why import exchange
 from studies.thesis.plans import StoredPlan, plan_at
 
 
-def _changed_at(data: xr.Dataset) -> int:
+def _changed_at(run: Run) -> int:
     """First sample of the second setpoint window."""
-    return int(np.flatnonzero(data.window.values > 0)[0])
+    return int(np.flatnonzero(run.window.values > 0)[0])
 
 
-def _plan(evidence: Evidence, role: str) -> StoredPlan:
+def _plan(evidence: Evidence, run: Run) -> StoredPlan:
     """The plan of the step of the setpoints."""
-    data = evidence.data
-    return plan_at(data, evidence.roles[role], float(data.time.values[_changed_at(data)]))
+    return plan_at(evidence.data, name_of(run), float(run.time.values[_changed_at(run)]))
 
 
-def _expected(evidence: Evidence, role: str) -> np.ndarray:
+def _expected(evidence: Evidence, run: Run) -> np.ndarray:
     """What the plan expects to end off the setpoints, ``"cv"`` [CV unit]."""
-    return _plan(evidence, role).cv[-1] - evidence.data.setpoint.values[_changed_at(evidence.data)]
+    return _plan(evidence, run).cv[-1] - run.setpoint.values[_changed_at(run)]
 
 
-def beyond_plan(evidence: Evidence, role: str) -> Finding:
+def beyond_plan(evidence: Evidence, run: Run) -> Finding:
     """Choke and lift go further than planned."""
-    plan, run, k = _plan(evidence, role), evidence.run(role), _changed_at(evidence.data)
+    plan, k = _plan(evidence, run), _changed_at(run)
     end = min(k + len(plan.cv), run.sizes["time"] - 1)  # the last sample of the horizon that was simulated
     start, reached = run.position.values[k - 1], run.position.values[end]
     beyond = (reached - plan.mv[-1]) * np.sign(plan.mv[-1] - start) > 0
@@ -41,55 +39,53 @@ def beyond_plan(evidence: Evidence, role: str) -> Finding:
         "planned": plan.mv[-1],
         "short_of": " and ".join(short_of),
         "off": evidence.rates((run.measurement - run.setpoint).values[end]),
-        "expected": evidence.rates(_expected(evidence, role)),
+        "expected": evidence.rates(_expected(evidence, run)),
     }
     return Finding(tuple(beyond), numbers)
 
 
-def plan_oil_first(evidence: Evidence, role: str) -> Finding:
+def plan_oil_first(evidence: Evidence, run: Run) -> Finding:
     """The plan leaves less of oil than of gas."""
-    run, off = evidence.run(role), _expected(evidence, role)
-    share = 100 * np.abs(off / evidence.data.setpoint.values[_changed_at(evidence.data)])
+    off = _expected(evidence, run)
+    share = 100 * np.abs(off / run.setpoint.values[_changed_at(run)])
     oil, gas = share[index(run, OIL)], share[index(run, GAS)]
     return Finding((oil < gas,), {"off": evidence.rates(off), "oil": oil, "gas": gas, "worth": exchange(run)})
 
 
-def feedback_reaches(evidence: Evidence, role: str) -> Finding:
+def feedback_reaches(evidence: Evidence, run: Run) -> Finding:
     """Feedback reaches what the plan did not expect to reach."""
-    near = STATIONARY * evidence.half(role)
-    off, real = _expected(evidence, role), late_deviation(evidence.run(role))
+    near = STATIONARY * run.tuning_deadzone.values
+    off, real = _expected(evidence, run), late_deviation(run)
     conditions = (np.abs(real) <= near).all(), (np.abs(off) > near).any()
     why = "plan" if conditions[0] else "feedback"
     return Finding(conditions, {"planned": evidence.rates(off), "settled": evidence.rates(real)}, why)
 
 
-def open_loop_off(evidence: Evidence, closed: str, blind: str) -> Finding:
+def open_loop_off(evidence: Evidence, closed: Run, blind: Run) -> Finding:
     """The open loop settles off the setpoints, the closed loop does not."""
-    off = [late_deviation(evidence.run(name)) for name in (blind, closed)]
-    far = [np.abs(away) / evidence.half(closed) > STATIONARY for away in off]
+    off = [late_deviation(run) for run in (blind, closed)]
+    far = [np.abs(away) / closed.tuning_deadzone.values > STATIONARY for away in off]
     conditions = far[0].any(), not far[1].any()
     why = "closed" if conditions[0] else "open"
     return Finding(conditions, {"blind": evidence.rates(off[0]), "closed": evidence.rates(off[1])}, why)
 
 
-def alike_at_first(evidence: Evidence, closed: str, blind: str) -> Finding:
+def alike_at_first(evidence: Evidence, closed: Run, blind: Run) -> Finding:
     """Open and closed loop respond alike at first."""
-    data, k = evidence.data, _changed_at(evidence.data)
-    dt = float(data.attrs["dt"])
-    one, other = evidence.run(blind), evidence.run(closed)
-    step = np.abs(data.setpoint.values[k] - data.setpoint.values[k - 1])
-    apart = np.abs(one.measurement.values - other.measurement.values)[k:] / step
+    k, dt = _changed_at(closed), float(closed.attrs["dt"])
+    step = np.abs(closed.setpoint.values[k] - closed.setpoint.values[k - 1])
+    apart = np.abs(blind.measurement - closed.measurement).values[k:] / step
     first = apart[: int(FIRST / dt)].max(axis=0)
     beyond = np.flatnonzero((apart > PLAN_ALIKE / 100).any(axis=1))
     numbers = {
         "first": evidence.rates(100 * first),
         "until": f", alike until {beyond[0] * dt:.0f} s" if beyond.size else "",
     }
-    choke = np.abs((one.position - other.position).sel(mv=CHOKE).values[k:])
+    choke = np.abs((blind.position - closed.position).sel(mv=CHOKE).values[k:])
     left = np.flatnonzero(choke > 0.05)
     why = "together"
     if left.size and left[0] > 0:
-        more = other.measurement.values[k + left[0]] - _plan(evidence, closed).cv[left[0] - 1]
+        more = closed.measurement.values[k + left[0]] - _plan(evidence, closed).cv[left[0] - 1]
         numbers |= {"leaves": left[0] * dt, "off": evidence.rates(more), "apart": choke.max()}
         why = "apart"
     return Finding(tuple(first <= PLAN_ALIKE / 100), numbers, why)

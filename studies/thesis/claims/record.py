@@ -28,81 +28,52 @@ ROLES = {  # by kind of controller and actuator, whatever the run is called
     ("mixed-integer", "step"): "integer",
 }
 Condition = bool | np.bool_
+Run = xr.Dataset  # the results with one controller
+# times of the controller steps of a run [s], "sample", by its name; the stored ones if None
+Clock = Callable[[str], np.ndarray] | None
 
 
 class Statement(msgspec.Struct, frozen=True):
-    """One statement of the thesis.
+    """One statement of the thesis."""
 
-    Attributes:
-        id: short and unique.
-        section: of the thesis that says it.
-        statement: the thesis, in our words.
-        definition: how it is measured.
-        rule: when it counts as holding.
-        study: of `studies.thesis.catalogue.STUDIES`, whose results are measured.
-        figures: ids of the figures that show it.
-    """
-
-    id: str
-    section: str
-    statement: str
-    definition: str
-    rule: str
-    study: str
-    figures: tuple[str, ...]
+    id: str  # short and unique
+    section: str  # of the thesis that says it
+    statement: str  # the thesis, in our words
+    definition: str  # how it is measured
+    rule: str  # when it counts as holding
+    study: str  # of `studies.thesis.catalogue.STUDIES`, whose results are measured
+    figures: tuple[str, ...]  # ids of the figures that show it
 
 
 class Claim(Statement, frozen=True):
-    """A statement and what the results say.
+    """A statement and what the results say."""
 
-    Attributes:
-        value: the numbers, with units.
-        verdict: one of `VERDICTS`.
-        reason: what the data say about why it does not hold; empty if it does.
-    """
-
-    value: str
-    verdict: str
-    reason: str
+    value: str  # the numbers, with units
+    verdict: str  # one of `VERDICTS`
+    reason: str  # what the data say about why it does not hold; empty if it does
 
     def written(self) -> dict[str, Any]:
         """The fields by name in the order of the files."""
-        words = ("id", "section", "statement", "definition", "rule")
-        return {
-            name: getattr(self, name) for name in (*words, "value", "verdict", "reason", "figures", "study")
-        }
+        words = ("id", "section", "statement", "definition", "rule", "value", "verdict", "reason")
+        return {name: getattr(self, name) for name in (*words, "figures", "study")}
 
 
 class Finding(NamedTuple):
-    """What a measurement gives.
+    """What a measurement gives."""
 
-    Attributes:
-        conditions: those of the rule; none if it cannot be tested on these results.
-        numbers: for the words of the row, by name.
-        why: which of its reasons is shown unless all conditions are met, where it has several.
-        instead: of the words of the row on its numbers.
-    """
-
-    conditions: tuple[Condition, ...]
-    numbers: dict[str, Any]
-    why: str = ""
-    instead: str = ""
+    conditions: tuple[Condition, ...]  # those of the rule; none if it cannot be tested on these results
+    numbers: dict[str, Any]  # for the words of the row, by name
+    why: str = ""  # which of its reasons is shown unless all conditions are met, where it has several
+    instead: str = ""  # of the words of the row on its numbers
 
 
 class Row(Statement, frozen=True, forbid_unknown_fields=True):
-    """A statement that can be measured, from ``rows.toml``.
+    """A statement that can be measured, from ``rows.toml``."""
 
-    Attributes:
-        needs: roles or names of the runs that the measurement is given.
-        measure: function that takes the evidence and the names of `needs`, as ``module.function``.
-        value: words for its numbers.
-        reason: words for why it fails, or several by what the measurement says.
-    """
-
-    needs: tuple[str, ...]
-    measure: str
-    value: str
-    reason: str | dict[str, str]
+    needs: tuple[str, ...]  # roles or names of the runs that the measurement is given
+    measure: str  # function that takes the evidence and the runs of `needs`, as module.function
+    value: str  # words for its numbers
+    reason: str | dict[str, str]  # words for why it fails, or several by what the measurement says
 
 
 class Rates:
@@ -117,25 +88,14 @@ class Rates:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the rows of one study are measured on.
+    """What the rows of one study are measured on."""
 
-    Attributes:
-        data: the finished runs of the study, loaded.
-        clock: times of the controller steps of a run [s], ``"sample"``, by its name; the stored ones if None.
-        given: from `studies.kpi.evaluate.key_figures`, if there already.
-    """
-
-    data: xr.Dataset
-    clock: Callable[[str], np.ndarray] | None = None
-    given: xr.Dataset | None = None
+    data: xr.Dataset  # the finished runs of the study, loaded
+    clock: Clock = None
+    given: xr.Dataset | None = None  # from `studies.kpi.evaluate.key_figures`, if there already
 
     @classmethod
-    def of(
-        cls,
-        data: xr.Dataset,
-        clock: Callable[[str], np.ndarray] | None = None,
-        given: xr.Dataset | None = None,
-    ) -> Evidence:
+    def of(cls, data: xr.Dataset, clock: Clock = None, given: xr.Dataset | None = None) -> Evidence:
         """From results with at least one finished run."""
         return cls(completed(data).load(), clock, given)
 
@@ -153,17 +113,18 @@ class Evidence:
             out.setdefault(ROLES.get((str(kind), str(actuator)), name), name)
         return out
 
-    def run(self, role: str) -> xr.Dataset:
+    def run(self, role: str) -> Run:
         """The results of one run."""
         return self.data.sel(controller=self.roles[role])
 
-    def figure(self, name: str, role: str) -> Any:
-        """A key figure of one run: a number or an array."""
-        return self.key[name].sel(controller=self.roles[role]).values[()]
+    @property
+    def runs(self) -> list[Run]:
+        """The results of every run."""
+        return [self.data.isel(controller=i) for i in range(self.data.sizes["controller"])]
 
-    def half(self, role: str) -> np.ndarray:
-        """Half widths of the deadzone, ``"cv"`` [CV unit]."""
-        return self.run(role).tuning_deadzone.values
+    def figure(self, name: str, run: Run) -> Any:
+        """A key figure of one run: a number or an array."""
+        return self.key[name].sel(controller=name_of(run)).values[()]
 
     def rates(self, values: np.ndarray) -> Rates:
         """Numbers ``"cv"`` for the words of a row."""
@@ -176,10 +137,9 @@ class Evidence:
         first = [f"{float(self.data.time.values[label == w][0]):,.0f}" for w in which]
         return f"window{'s' if len(first) > 1 else ''} from {', '.join(first)} s"
 
-    def times(self, role: str) -> np.ndarray:
+    def times(self, run: Run) -> np.ndarray:
         """Times of the controller steps [s], ``"sample"``."""
-        name = self.roles[role]
-        return self.run(role).solve_time.values if self.clock is None else self.clock(name)
+        return run.solve_time.values if self.clock is None else self.clock(name_of(run))
 
 
 def claim_of(row: Row, found: Finding) -> Claim:
@@ -197,9 +157,12 @@ def claim_of(row: Row, found: Finding) -> Claim:
 
 def verdict(*conditions: Condition) -> str:
     """Holds if all conditions are met, in part if some are."""
-    if all(conditions):
-        return VERDICTS[0]
-    return VERDICTS[1] if any(conditions) else VERDICTS[2]
+    return VERDICTS[0 if all(conditions) else 1 if any(conditions) else 2]
+
+
+def name_of(run: Run) -> str:
+    """Of the controller of a run."""
+    return str(run.controller.item())
 
 
 def short(cv: str) -> str:
@@ -207,7 +170,7 @@ def short(cv: str) -> str:
     return str(cv).removesuffix("_rate")
 
 
-def index(run: xr.Dataset, name: str) -> int:
+def index(run: Run, name: str) -> int:
     """Position of a CV or an MV on its axis."""
     axis = "mv" if name in (CHOKE, LIFT) else "cv"
     return [str(known) for known in run[axis].values].index(name)
@@ -218,13 +181,13 @@ def late(data: xr.Dataset) -> xr.Dataset:
     return data.isel(time=np.flatnonzero(data.time.values > data.time.values[-1] - LATE))
 
 
-def late_deviation(run: xr.Dataset) -> np.ndarray:
+def late_deviation(run: Run) -> np.ndarray:
     """Mean of measured minus setpoint over the last `LATE` seconds, ``"cv"`` [CV unit]."""
     end = late(run)
     return (end.measurement - end.setpoint).mean("time").values
 
 
-def choke_travel(run: xr.Dataset) -> float:
+def choke_travel(run: Run) -> float:
     """Travel of the actual choke position from the first sample on [%]."""
     position = run.position.sel(mv=CHOKE).values
     return float(travel(moves_of(position, position[0])))
@@ -232,11 +195,8 @@ def choke_travel(run: xr.Dataset) -> float:
 
 def quarters(window: np.ndarray) -> list[np.ndarray]:
     """Samples of the last quarter of every setpoint window."""
-    out = []
-    for w in range(int(window.max()) + 1):
-        samples = np.flatnonzero(window == w)
-        out.append(samples[(3 * len(samples)) // 4 :])
-    return out
+    groups = (np.flatnonzero(window == w) for w in range(int(window.max()) + 1))
+    return [samples[(3 * len(samples)) // 4 :] for samples in groups]
 
 
 def swing(values: np.ndarray, groups: list[np.ndarray]) -> np.ndarray:

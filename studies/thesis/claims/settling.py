@@ -9,16 +9,15 @@ from studies.kpi.evaluate import NEAR_CLOSED, distance_to_reach, final_deviation
 from studies.kpi.loop import second_halves
 from studies.thesis.claims.comparison import hunting, off_windows
 from studies.thesis.claims.limits import FULL, NEARLY_CLOSED, OUT_OF_REACH, STATIONARY, STEP
-from studies.thesis.claims.record import Evidence, Finding, index, quarters, short, swing
+from studies.thesis.claims.record import Evidence, Finding, Run, index, name_of, quarters, short, swing
 from studies.thesis.claims.why import compromise, exchange
 
 # ------------------------------------------------------------------------------------------------ convergence
 
 
-def converges(evidence: Evidence, role: str) -> Finding:
+def converges(evidence: Evidence, run: Run) -> Finding:
     """Most windows end at their setpoints, and soon."""
-    run, window = evidence.run(role), evidence.data.window.values
-    arrived = ~off_windows(evidence, role)
+    arrived, window = ~off_windows(evidence, run), run.window.values
     outside = (np.abs(run.measurement.values - run.setpoint.values) > run.tuning_deadzone.values).any(axis=1)
     times = []
     for w in np.flatnonzero(arrived):
@@ -32,9 +31,9 @@ def converges(evidence: Evidence, role: str) -> Finding:
     return Finding((arrived.mean() > 0.5,), numbers)
 
 
-def comes_to_rest(evidence: Evidence, role: str) -> Finding:
+def comes_to_rest(evidence: Evidence, run: Run) -> Finding:
     """CVs and choke stand still at the end of a window."""
-    run, groups = evidence.run(role), quarters(evidence.data.window.values)
+    groups = quarters(run.window.values)
     cv = (swing(run.measurement.values, groups) / run.tuning_deadzone.values).max(axis=1)
     position = run.position.sel(mv=CHOKE).values
     choke = swing(position, groups)
@@ -53,14 +52,14 @@ def comes_to_rest(evidence: Evidence, role: str) -> Finding:
     return Finding(conditions, numbers, "choke" if creeping.any() else "rates")
 
 
-def oil_first(evidence: Evidence, role: str) -> Finding:
+def oil_first(evidence: Evidence, run: Run) -> Finding:
     """Out of reach, oil ends nearer to its setpoint than gas."""
-    data, run = evidence.data, evidence.run(role)
+    data = evidence.data
     out = distance_to_reach(data) > OUT_OF_REACH
     if not out.any():
         return Finding((), {}, instead="no target is out of reach")
     target = np.array([run.setpoint.values[samples[0]] for samples in quarters(data.window.values)])
-    away = final_deviation(data, evidence.roles[role]) * run.tuning_deadzone.values
+    away = final_deviation(data, name_of(run)) * run.tuning_deadzone.values
     share = 100 * np.abs(away / target)
     oil, gas = share[:, index(data, OIL)], share[:, index(data, GAS)]
     first = oil < gas
@@ -77,8 +76,7 @@ def saturates(evidence: Evidence) -> Finding:
     """Both MVs end at their upper limits."""
     last = quarters(evidence.data.window.values)[-1]
     parts, full = [], []
-    for name in evidence.data.controller.values:
-        run = evidence.run(str(name))
+    for run in evidence.runs:
         low, high = run.tuning_mv_low.values, run.tuning_mv_high.values
         least = run.position.values[last].min(axis=0)
         full.append((least >= high - FULL * (high - low)).all())
@@ -92,8 +90,7 @@ def saturates(evidence: Evidence) -> Finding:
 def spikes(evidence: Evidence) -> Finding:
     """The filtered bias jumps less than the raw one."""
     parts, ratios, undone, total = [], [], 0, 0
-    for name in evidence.data.controller.values:
-        run = evidence.run(str(name))
+    for run in evidence.runs:
         half = run.tuning_deadzone.values
         raw, filtered = (np.diff(run[key].values, axis=0) / half for key in ("bias_raw", "bias"))
         ratios.append(np.abs(filtered).max(axis=0) / np.maximum(np.abs(raw).max(axis=0), 1e-12))
@@ -106,30 +103,29 @@ def spikes(evidence: Evidence) -> Finding:
     return Finding(((ratio < 1).all(), (ratio <= 0.5).all()), numbers)
 
 
-def bias_settles(evidence: Evidence, role: str) -> Finding:
+def bias_settles(evidence: Evidence, run: Run) -> Finding:
     """The bias stands still at the end of a window."""
-    run, groups = evidence.run(role), quarters(evidence.data.window.values)
+    groups = quarters(run.window.values)
     moved = (swing(run.bias.values, groups) / run.tuning_deadzone.values).max(axis=1)
     settled = moved <= STATIONARY
     numbers = {"settled": settled.sum(), "count": len(settled), "most": moved.max()}
     return Finding((settled.mean() > 0.5, settled.all()), numbers | {"moving": evidence.starts(~settled)})
 
 
-def bias_swings(evidence: Evidence, role: str) -> Finding:
+def bias_swings(evidence: Evidence, run: Run) -> Finding:
     """The bias swings where the choke does."""
-    run, late = evidence.run(role), second_halves(evidence.data.window.values)
-    halves = [np.flatnonzero(late == w) for w in range(int(evidence.data.window.values.max()) + 1)]
+    late = second_halves(run.window.values)
+    halves = [np.flatnonzero(late == w) for w in range(int(run.window.values.max()) + 1)]
     moved = (swing(run.bias.values, halves) / run.tuning_deadzone.values).max(axis=1)
-    hunts, _ = hunting(evidence, role)
+    hunts, _ = hunting(evidence, run)
     if not hunts.any() or hunts.all():
         return Finding((), {}, instead="every window is alike")
     a, b = np.median(moved[hunts]), np.median(moved[~hunts])
     return Finding((a > b, a > b and a >= 3 * b), {"hunting": a, "count": hunts.sum(), "others": b})
 
 
-def bias_large(evidence: Evidence, role: str) -> Finding:
+def bias_large(evidence: Evidence, run: Run) -> Finding:
     """The bias is large, above all near a closed choke."""
-    run = evidence.run(role)
     size = np.abs(run.bias.values) / run.tuning_deadzone.values
     closed = run.position.sel(mv=CHOKE).values < NEARLY_CLOSED
     largest = size.max(axis=0)

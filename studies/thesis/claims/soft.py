@@ -5,38 +5,36 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-import xarray as xr
 
 from studies.definition.presets import CHOKE, OIL
 from studies.kpi.loop import moves_of, reversal_events, second_halves
 from studies.thesis.claims.limits import FAR, FAR_MORE, HUNTING, MOST, NEARLY_CLOSED
-from studies.thesis.claims.record import Evidence, Finding, index
+from studies.thesis.claims.record import Evidence, Finding, Run, index, name_of
 from studies.thesis.claims.why import horizon_cost
 from studies.thesis.plans import plan_at
 
 
-def turns(run: xr.Dataset) -> np.ndarray:
+def turns(run: Run) -> np.ndarray:
     """Whether the choke turns back, both moves in one setpoint window, ``"sample"``."""
     position = run.position.sel(mv=CHOKE).values
     start = run.demand.sel(mv=CHOKE).values[0] - run.move.sel(mv=CHOKE).values[0]
     return np.asarray(reversal_events(moves_of(position, start), segment=run.window.values))
 
 
-def turns_by_window(run: xr.Dataset) -> np.ndarray:
+def turns_by_window(run: Run) -> np.ndarray:
     """How often the choke turns back in every setpoint window, ``"window"``."""
     window = run.window.values
     return np.bincount(window[turns(run)], minlength=int(window.max()) + 1)
 
 
-def _said(run: xr.Dataset) -> str:
+def _said(run: Run) -> str:
     counts = turns_by_window(run)
     total = counts.sum()
     return f"{total} reversal{'s' if total != 1 else ''}, up to {counts.max()} in a window"
 
 
-def oscillates(evidence: Evidence, role: str) -> Finding:
+def oscillates(evidence: Evidence, run: Run) -> Finding:
     """The choke swings, near closed, and goes on swinging."""
-    run = evidence.run(role)
     turned, window, time = turns(run), run.window.values, run.time.values
     closed = (turned & (run.position.sel(mv=CHOKE).values < NEARLY_CLOSED)).sum()
     lasting = (turned & (second_halves(window) >= 0)).sum()
@@ -49,9 +47,9 @@ def oscillates(evidence: Evidence, role: str) -> Finding:
     return Finding(conditions, numbers, "dies" if total else "still")
 
 
-def removes(evidence: Evidence, *names: str) -> Finding:
+def removes(evidence: Evidence, *runs: Run) -> Finding:
     """With Soft MPC, the run ``soft``, no window oscillates; without it, the other run, one does."""
-    run, hard = evidence.run("soft"), evidence.run(next(name for name in names if name != "soft"))
+    run, hard = sorted(runs, key=lambda one: name_of(one) != "soft")
     counts, without = turns_by_window(run), turns_by_window(hard)
     numbers = {"with": _said(run), "without": _said(hard)}
     if without.max() < HUNTING:
@@ -64,31 +62,30 @@ def removes(evidence: Evidence, *names: str) -> Finding:
     return Finding((counts.max() < HUNTING,), numbers)
 
 
-def _penalty(run: xr.Dataset, half_widths: float) -> np.ndarray:
+def _penalty(run: Run, half_widths: float) -> np.ndarray:
     """What a sample that is some half widths of the deadzone off costs, ``"cv"``."""
     off = half_widths * run.tuning_deadzone.values
     return np.array([horizon_cost(run, alone[None]) for alone in np.diag(off)])
 
 
-def penalises_less(evidence: Evidence, nominal: str, soft: str) -> Finding:
+def penalises_less(evidence: Evidence, nominal: Run, soft: Run) -> Finding:
     """Soft MPC charges less inside the deadzone and about the same far outside."""
-    runs = evidence.run(soft), evidence.run(nominal)
-    inside, outside = (_penalty(runs[0], at) / _penalty(runs[1], at) for at in (1.0, FAR))
+    inside, outside = (_penalty(soft, at) / _penalty(nominal, at) for at in (1.0, FAR))
     conditions = (inside < 1).all(), (np.abs(outside - 1) <= 0.25).all()
     numbers = {"inside": evidence.rates(100 * inside), "outside": evidence.rates(100 * outside)}
     return Finding(conditions, numbers, "outside" if conditions[0] else "inside")
 
 
-def better(evidence: Evidence, *names: str) -> Finding:
+def better(evidence: Evidence, *runs: Run) -> Finding:
     """Soft MPC turns and travels less than without its penalty, or with a hard weight in place of it."""
-    count = [turns(evidence.run(name)).sum() for name in names]
-    way = [evidence.figure("choke_travel", name) for name in names]
-    cheap = _penalty(evidence.run(names[2]), FAR) / _penalty(evidence.run(names[0]), FAR)
+    count = [turns(run).sum() for run in runs]
+    way = [evidence.figure("choke_travel", run) for run in runs]
+    cheap = _penalty(runs[2], FAR) / _penalty(runs[0], FAR)
     conditions = tuple(count[0] < count[i] and way[0] < way[i] for i in (1, 2))
     return Finding(conditions, {"count": count, "way": way, "cheap": 100 * cheap.min()})
 
 
-def responses(run: xr.Dataset, data: xr.Dataset) -> np.ndarray:
+def responses(run: Run, data: Run) -> np.ndarray:
     """Predicted and actual change of the CVs from a turn of the choke to the next, ``"turn kind cv"`` [CV unit].
 
     Args:
@@ -100,14 +97,13 @@ def responses(run: xr.Dataset, data: xr.Dataset) -> np.ndarray:
     for k, end in itertools.pairwise(at):
         if window[k] != window[end] or end - k > int(run.prediction_horizon) or len(out) == MOST:
             continue
-        plan = plan_at(data, str(run.controller.item()), float(run.time.values[k]))
+        plan = plan_at(data, name_of(run), float(run.time.values[k]))
         out.append([plan.cv[end - k - 1] - y[k], y[end] - y[k]])
     return np.array(out).reshape(-1, 2, run.sizes["cv"])
 
 
-def mismatch(evidence: Evidence, role: str) -> Finding:
+def mismatch(evidence: Evidence, run: Run) -> Finding:
     """The well answers the turns of the choke far more than predicted."""
-    run = evidence.run(role)
     found = np.abs(responses(run, evidence.data))
     if not len(found):
         return Finding((), {}, instead="no two turns of the choke in one window")

@@ -15,20 +15,11 @@ HEAD = ("id", "section", "the thesis says", "measured", "holds if", "value", "ve
 
 def markdown(claims: Sequence[Claim], title: str) -> str:
     """One table: what the thesis says, how it is measured, what came out, and the verdict."""
-    rows = [
-        (
-            f"`{claim.id}`",
-            claim.section,
-            claim.statement,
-            claim.definition,
-            claim.rule,
-            claim.value,
-            claim.verdict + (f": {claim.reason}" if claim.reason else ""),
-            ", ".join(claim.figures) or "–",
-            claim.study,
-        )
-        for claim in claims
-    ]
+    rows = []
+    for claim in claims:
+        said = claim.verdict + (f": {claim.reason}" if claim.reason else "")
+        words = claim.section, claim.statement, claim.definition, claim.rule, claim.value, said
+        rows.append((f"`{claim.id}`", *words, ", ".join(claim.figures) or "–", claim.study))
     return "\n".join([f"# {title}", "", f"{tally(claims)}.", "", *markdown_table(HEAD, rows), ""])
 
 
@@ -50,8 +41,7 @@ def page(claims: Sequence[Claim], title: str, note: str, gallery: str) -> str:
     """The table as one HTML page.
 
     Args:
-        claims: the measured statements.
-        title: of the page.
+        claims, title: what it shows.
         note: one sentence on the results that they are measured on.
         gallery: page of the figures, relative to this one; figure 12 is its ``#figure-12``.
     """

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-import xarray as xr
 
 from studies.definition.presets import CHOKE, GAS, LIFT, OIL
 from studies.kpi.loop import closed_loop_cost
+from studies.thesis.claims.record import Run, index
 
 
-def slope(run: xr.Dataset, deviation: np.ndarray) -> np.ndarray:
+def slope(run: Run, deviation: np.ndarray) -> np.ndarray:
     """Derivative of what one sample costs in (6.6) by the CV, ``"cv"``: 2 Q d + sign(d) (2 S eta + s [eta > 0]).
 
-    Args:
-        run: one controller of the results, whose tuning counts.
-        deviation: d = y - r, ``"cv"`` [CV unit]; eta = max(|d| - c, 0).
+    Here `deviation` is d = y - r, ``"cv"`` [CV unit], eta = max(|d| - c, 0), and the tuning that of the run.
     """
     weight, quadratic, linear, half = (
         run[f"tuning_{name}"].values for name in ("cv_weight", "soft_quadratic", "soft_linear", "deadzone")
@@ -23,7 +21,7 @@ def slope(run: xr.Dataset, deviation: np.ndarray) -> np.ndarray:
     return 2 * weight * deviation + np.sign(deviation) * (2 * quadratic * beyond + linear * (beyond > 0))
 
 
-def pulls(run: xr.Dataset, deviation: np.ndarray) -> np.ndarray:
+def pulls(run: Run, deviation: np.ndarray) -> np.ndarray:
     """What another unit of each MV would change of the cost of one settled sample, ``"cv mv"``.
 
     That is `slope` times the steady gains of the prediction model; where the columns add up to about zero, the MV stands
@@ -32,20 +30,18 @@ def pulls(run: xr.Dataset, deviation: np.ndarray) -> np.ndarray:
     return slope(run, deviation)[:, None] * run.model_coefficient.values[:, :, -1]
 
 
-def compromise(run: xr.Dataset, deviation: np.ndarray) -> str:
+def compromise(run: Run, deviation: np.ndarray) -> str:
     """How oil and gas pull at the lift at some deviation, in words with numbers."""
-    pull = pulls(run, deviation)
-    cvs, mvs = ([str(name) for name in run[axis].values] for axis in ("cv", "mv"))
-    oil, gas = (pull[cvs.index(cv), mvs.index(LIFT)] for cv in (OIL, GAS))
+    pull = pulls(run, deviation)[:, index(run, LIFT)]
+    oil, gas = pull[index(run, OIL)], pull[index(run, GAS)]
     balanced = oil * gas < 0 and abs(oil + gas) <= 0.25 * max(abs(oil), abs(gas))
     words = "balance: no lift is better" if balanced else "do not balance"
     return f"the pulls of oil ({oil:+.2g}) and gas ({gas:+.2g}) on the lift, per m3/h of lift and sample, {words}"
 
 
-def exchange(run: xr.Dataset) -> str:
+def exchange(run: Run) -> str:
     """How little the larger weight of oil is worth, in words with numbers."""
-    cvs, lift = [str(cv) for cv in run.cv.values], [str(mv) for mv in run.mv.values].index(LIFT)
-    oil, gas = cvs.index(OIL), cvs.index(GAS)
+    oil, gas, lift = (index(run, name) for name in (OIL, GAS, LIFT))
     gain, weight = run.model_coefficient.values[:, lift, -1], run.tuning_cv_weight.values
     if not weight[gas] * gain[gas] * gain[oil]:
         return "the lift moves one of the rates only, or only one of them has a weight"
@@ -57,7 +53,7 @@ def exchange(run: xr.Dataset) -> str:
     )
 
 
-def price_of_a_step(run: xr.Dataset, deviation: np.ndarray) -> tuple[float, float]:
+def price_of_a_step(run: Run, deviation: np.ndarray) -> tuple[float, float]:
     """What one whole step of the choke, made now from rest, would save over the horizon by the model, and what it costs.
 
     Args:
@@ -68,29 +64,19 @@ def price_of_a_step(run: xr.Dataset, deviation: np.ndarray) -> tuple[float, floa
         The larger saving of a step up and one down, the lift at rest; negative if neither saves anything. And the move
         weight of the step, in the unit of the objective.
     """
-    at = [str(name) for name in run.mv.values].index(CHOKE)
+    at = index(run, CHOKE)
     size = float(run.tuning_move_high.values[at])
     lag = np.minimum(np.arange(int(run.prediction_horizon)), run.sizes["lag"] - 1)  # S(N+1) = S(N)
     effect = run.model_coefficient.values[:, at, lag].T
-    after = [
-        horizon_cost(run, deviation + sign * size * effect)
-        for sign, room in (
-            (1, run.tuning_mv_high.values[at] - run.position.values[-1, at]),
-            (-1, run.position.values[-1, at] - run.tuning_mv_low.values[at]),
-        )
-        if room >= size
-    ]
+    low, stands, high = (v[at] for v in (run.tuning_mv_low, run.position[-1], run.tuning_mv_high))
+    rooms = {size: high - stands, -size: stands - low}
+    after = [horizon_cost(run, deviation + step * effect) for step, room in rooms.items() if room >= size]
     saved = horizon_cost(run, deviation + 0.0 * effect) - min(after, default=np.inf)
     return saved, float(run.tuning_move_weight.values[at]) * size**2
 
 
-def horizon_cost(run: xr.Dataset, deviation: np.ndarray) -> float:
-    """What the deviations of a horizon cost in (6.6), moves and limits left out.
-
-    Args:
-        run: one controller of the results, whose tuning counts.
-        deviation: ``"horizon cv"`` [CV unit].
-    """
+def horizon_cost(run: Run, deviation: np.ndarray) -> float:
+    """What the deviations of a horizon, ``"horizon cv"`` [CV unit], cost in (6.6), moves and limits left out."""
     names = ("cv_weight", "soft_quadratic", "soft_linear", "deadzone", "move_weight")
     weights = {name: run[f"tuning_{name}"].values for name in names}
     none = np.zeros_like(deviation)
