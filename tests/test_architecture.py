@@ -31,9 +31,7 @@ DOORS = {
     "optuna": ("studies/search/run.py",),
     "scipy": ("jaxmpc/integer/tighten.py", "studies/bench/", "studies/definition/axes.py"),
     "clarabel": ("jaxmpc/integer/tighten.py", "studies/bench/peers.py"),
-    **dict.fromkeys(
-        ("piqp", "osqp", "daqp", "qpax", "pyscipopt", "gurobipy"), ("studies/bench/peers.py",)
-    ),
+    **dict.fromkeys(("piqp", "osqp", "daqp", "qpax", "pyscipopt", "gurobipy"), ("studies/bench/peers.py",)),
 }
 COLUMN = (
     "model",

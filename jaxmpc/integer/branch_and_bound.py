@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxmpc.integer.cuts import Cuts
 from jaxmpc.integer.feasible import (
+    Chain,
     MoveLimits,
     around,
     needed,
@@ -354,7 +355,7 @@ class _Tree:
         # a relaxation that did not get to its end may know less than its parent's prices, which hold here, too
         if np.isfinite(result.x[lane]).all() and result.bound[lane] >= parent.model.value:
             model = self.search.lower_model(result, lane, child.limits.lower, child.limits.upper)
-            model = model.priced(result.warm.hard_price[lane][self.search.position_rows], child.limits)
+            model = model.priced(result.hard[lane][self.search.position_rows], child.limits)
             start = result.start(lane)
         return _Node(bound, tight.lane(0), model, start)
 

@@ -63,6 +63,11 @@ class Relaxations:
         return self.warm.envelope_price  # pyright: ignore[reportReturnType]
 
     @property
+    def hard(self) -> np.ndarray:
+        """Prices of the hard rows, ``"batch hard"``, upper limits positive."""
+        return self.warm.hard_price  # pyright: ignore[reportReturnType]
+
+    @property
     def position(self) -> np.ndarray:
         """Prices of the chords of squared positions, ``"batch position"``; empty where there are none."""
         return self.warm.position_price  # pyright: ignore[reportReturnType]

@@ -104,7 +104,7 @@ def _line(search: Search, starts: Sequence[np.ndarray], finish: str, last: bool)
         return search.finish(None, root_bound)
     model, lower, upper = search.lower_model(root, 0, low, high), low, high
     own = MoveLimits(low, high, *position_limits(search.chains))
-    model = model.priced(root.warm.hard_price[0][search.position_rows], own)
+    model = model.priced(root.hard[0][search.position_rows], own)
     point = np.clip(whole(model.center), low, high)
     if not satisfied(search.chains, point[None], low, high)[0]:
         lower, upper, possible = (part[0] for part in propagate(search.chains, low[None], high[None]))
@@ -133,9 +133,9 @@ def _line(search: Search, starts: Sequence[np.ndarray], finish: str, last: bool)
         if not possible[0]:
             return search.finish("fixing" if finish == "auto" else finish, np.inf)
         if (lower == upper).all() and finish == "auto":
-            last = search.new([lower])
-            if len(last):
-                yield from search.evaluate(last)
+            only = search.new([lower])
+            if len(only):
+                yield from search.evaluate(only)
             return search.finish("fixing", np.inf)
     if finish in ("auto", "enumeration"):
         limited = finish == "auto"

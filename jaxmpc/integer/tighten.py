@@ -13,6 +13,8 @@ the relaxation is for positions that are anywhere.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
@@ -32,6 +34,8 @@ def chord_weights(curvature: Float[np.ndarray, "position position"]) -> Float[np
     import clarabel  # here, because few problems come so far
     import scipy.sparse as sp
 
+    solver: Any = clarabel  # names its parts at run time
+
     size = np.sqrt(np.maximum(np.diag(curvature), 0.0))
     nothing = np.zeros(len(size))
     if not size.any():
@@ -50,11 +54,11 @@ def chord_weights(curvature: Float[np.ndarray, "position position"]) -> Float[np
     inside = sp.csc_matrix((np.full(count, 2.0), (place, np.arange(count))), shape=(len(rows), count))
     constraints = sp.vstack([inside, -sp.identity(count)]).tocsc()
     values = np.concatenate([weights * scaled[rows, columns], nothing])
-    cones = [clarabel.PSDTriangleConeT(count), clarabel.NonnegativeConeT(count)]
-    settings = clarabel.DefaultSettings()
+    cones = [solver.PSDTriangleConeT(count), solver.NonnegativeConeT(count)]
+    settings = solver.DefaultSettings()
     settings.verbose = False
     none = sp.csc_matrix((count, count))
-    solution = clarabel.DefaultSolver(none, -worth, constraints, values, cones, settings).solve()
+    solution = solver.DefaultSolver(none, -worth, constraints, values, cones, settings).solve()
     found = np.asarray(solution.x)
     if not np.isfinite(found).all():
         return nothing

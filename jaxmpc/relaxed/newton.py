@@ -315,7 +315,7 @@ def refine(problem: Prepared, start: WarmStart) -> QpSolution:
         change = sum(jnp.sum(g**2 / sigma) for g, sigma in zip(gained, proximal.sigma, strict=True))
         settled = (left < SETTLED * (1.0 + largest)) | (left < INEXACT * jnp.sqrt(change))
         worth = jax.tree.map(lambda gain, new: jnp.abs(gain * new), gained, prices)
-        owed = sum(jnp.sum(w / sigma) for w, sigma in zip(worth, proximal.sigma, strict=True))
+        owed = jnp.asarray(sum(jnp.sum(w / sigma) for w, sigma in zip(worth, proximal.sigma, strict=True)))
         outside = jnp.max(jnp.abs(gained.hard) / proximal.sigma.hard, initial=0.0)
         # a kink close by stops a step that has hardly any curvature before it: shorter ones get on
         short = alpha < jnp.where(state.stiffness < STIFF, SHORTER, SHORT)

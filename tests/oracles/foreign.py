@@ -19,9 +19,9 @@ def solution_of(x, row, envelope, limit, lower, upper, row_low, row_high) -> QpS
     """Moves and prices alone; everything that a solver would say of itself is not a number."""
     nothing = jnp.asarray(jnp.nan)
     as_arrays = (jnp.asarray(v, dtype=float) for v in (row, envelope, limit, lower, upper, row_low, row_high))
-    return QpSolution(
-        jnp.asarray(x, dtype=float), nothing, nothing, jnp.asarray(-1), jnp.asarray(0), *as_arrays, nothing
-    )
+    row, envelope, *rest = as_arrays
+    answer = jnp.asarray(x, dtype=float), nothing, nothing, jnp.asarray(-1), jnp.asarray(0)
+    return QpSolution(*answer, row, envelope, jnp.zeros(0), *rest, nothing)
 
 
 def inequalities(qp: CondensedQp, rows: np.ndarray, instance: QpInstance):
