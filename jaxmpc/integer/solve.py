@@ -1,10 +1,10 @@
-"""Exact whole moves (thesis 6.1, 6.5, 6.6): relaxation, fixing, enumeration under cuts, HiGHS, branch and bound.
+"""Exact whole moves (thesis 6.1, 6.5, 6.6): relaxation, fixing, enumeration under cuts, branch and bound.
 
 The line of a solve: one tight relaxation bounds the problem and nearly always finds whole moves by itself; otherwise its
 moves are rounded and solved, for an incumbent and a quadratic cut; prices fix every move that cannot improve on it;
 what is left is listed and pruned by cuts of the best candidates; where the list is too long, the shifted previous
-plan and the best moves by the prices are tried, and a reduced MILP, or branch and bound over batched relaxations, closes
-the rest. Every path ends with the same certificate:
+plan and the best moves by the prices are tried, and branch and bound over batched relaxations closes the rest, HiGHS over
+cuts where it is asked to. Every path ends with the same certificate:
 incumbent, lower bound, gap. `plan` and the mixed-integer controllers call this for one step or many side by side.
 """
 
@@ -32,7 +32,6 @@ from jaxmpc.relaxed.gap import closes
 from jaxmpc.status import INFEASIBLE, OPTIMAL
 
 BEAM = 64  # partial candidates kept while looking for good first moves
-HIGHS_SECONDS = 0.1  # what the reduced MILP may take before branch and bound closes the rest
 UNINTERRUPTED = 0.05  # time limits from which on a search may run as one compiled call [s]
 FINISHES = ("auto", "enumeration", "highs", "branch-and-bound")
 
@@ -147,14 +146,10 @@ def _line(search: Search, starts: Sequence[np.ndarray], finish: str, last: bool)
             return search.finish("enumeration" if done else None, np.inf if done else root_bound)
     if not last and c.chord_weight.any():
         return search.finish(None, root_bound)
-    if finish in ("auto", "highs"):
+    if finish == "highs":
         seconds = search.seconds_left()
-        if finish == "auto":
-            seconds = HIGHS_SECONDS if seconds is None else min(seconds, HIGHS_SECONDS)
         done, bound = yield from outer_approximation(search, model, cuts, lower, upper, seconds)
-        root_bound = max(root_bound, min(bound, search.value))
-        if done or finish == "highs" or search.out_of_time():
-            return search.finish("highs" if done else None, root_bound)
+        return search.finish("highs" if done else None, max(root_bound, min(bound, search.value)))
     bound = yield from branch_and_bound(search, root, model, cuts, lower, upper, root_bound)
     return search.finish("branch-and-bound", bound)
 
