@@ -18,6 +18,7 @@ from jaxmpc.integer.lower_bound import LowerModel
 from jaxmpc.integer.relaxer import LaneLimits, Relaxations
 from jaxmpc.integer.tables import Constants
 from jaxmpc.problem.instance import QpInstance
+from jaxmpc.programs.clock import Clock
 from jaxmpc.relaxed.gap import FINEST, closes, cutoff, reference
 from jaxmpc.relaxed.newton import WarmStart
 from jaxmpc.status import FAILED, INFEASIBLE, LIMIT, OPTIMAL
@@ -89,7 +90,8 @@ class Search:
         self.left_out = np.inf  # least bound of everything that was discarded
         self.nodes = 1
         self.seen: set[bytes] = set()
-        self.spent = 0.0  # seconds of work so far, kept by the scheduler
+        self.spent = 0.0  # seconds of work so far, kept by the scheduler,
+        self.clock: Clock | None = None  # with what has run since
 
     # ---- bookkeeping
     @property
@@ -104,11 +106,14 @@ class Search:
 
     def out_of_time(self) -> bool:
         """Whether the time limit is used up."""
-        return self.time_limit is not None and self.spent >= self.time_limit
+        return self.time_limit is not None and self._used() >= self.time_limit
+
+    def _used(self) -> float:
+        return self.spent + (self.clock.seconds if self.clock else 0.0)
 
     def seconds_left(self) -> float | None:
         """Seconds to the time limit, None without one."""
-        return None if self.time_limit is None else max(self.time_limit - self.spent, 0.0)
+        return None if self.time_limit is None else max(self.time_limit - self._used(), 0.0)
 
     def discard(self, bound: float) -> None:
         """Record the bound of something that is not searched further."""

@@ -30,12 +30,13 @@ class _Run:
 
     def send(self, value) -> None:
         """Go on with an answer, up to the next question or the end."""
-        clock = Clock()
+        clock = self.search.clock = Clock()
         try:
             self.waits = self.steps.send(value)
         except StopIteration as end:
             self.waits, self.result = None, end.value
         self.search.spent += clock.seconds
+        self.search.clock = None
 
 
 def run(

@@ -62,16 +62,19 @@ def chord_weights(curvature: Float[np.ndarray, "position position"]) -> Float[np
     found = np.asarray(solution.x)
     if not np.isfinite(found).all():
         return nothing
-    found = np.where(found > LEAST, np.maximum(found, 0.0), 0.0)
-    return 0.9 * _convex_share(scaled, found) * found * unit**2
+    found = np.where(found > LEAST, found, 0.0)
+    found = _convex_share(scaled, found) * found
+    return 0.9 * np.where(found > LEAST, found, 0.0) * unit**2
 
 
 def _convex_share(curvature: np.ndarray, found: np.ndarray) -> float:
     """The largest share of `found` that leaves the curvature positive semidefinite, a little less."""
+    # directions without curvature have eigenvalues of zero, which come out a little below it as often as not
+    rounding = len(curvature) * np.finfo(float).eps * np.trace(curvature)
     low, high = 0.0, 1.0
     for _ in range(40):
         middle = 0.5 * (low + high)
-        good = np.linalg.eigvalsh(curvature - 2.0 * middle * np.diag(found))[0] >= 0.0
+        good = np.linalg.eigvalsh(curvature - 2.0 * middle * np.diag(found))[0] >= -rounding
         low, high = (middle, high) if good else (low, middle)
         if good and middle > 1.0 - SAFE:
             break

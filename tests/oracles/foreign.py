@@ -18,10 +18,11 @@ from jaxmpc.relaxed.problem import QpSolution
 def solution_of(x, row, envelope, limit, lower, upper, row_low, row_high) -> QpSolution:
     """Moves and prices alone; everything that a solver would say of itself is not a number."""
     nothing = jnp.asarray(jnp.nan)
-    as_arrays = (jnp.asarray(v, dtype=float) for v in (row, envelope, limit, lower, upper, row_low, row_high))
-    row, envelope, *rest = as_arrays
-    answer = jnp.asarray(x, dtype=float), nothing, nothing, jnp.asarray(-1), jnp.asarray(0)
-    return QpSolution(*answer, row, envelope, jnp.zeros(0), *rest, nothing)
+    prices = row, envelope, np.zeros(0), limit, lower, upper, row_low, row_high
+    as_arrays = (jnp.asarray(v, dtype=float) for v in prices)
+    return QpSolution(
+        jnp.asarray(x, dtype=float), nothing, nothing, jnp.asarray(-1), jnp.asarray(0), *as_arrays, nothing
+    )
 
 
 def inequalities(qp: CondensedQp, rows: np.ndarray, instance: QpInstance):
@@ -94,6 +95,26 @@ def foreign_solution(qp: CondensedQp, rows: np.ndarray, instance: QpInstance, so
     limit = p["high"] - p["low"] if qp.has_limits else np.zeros(0)
     rest = (p[name] for name in ("lower", "upper", "row_low", "row_high"))
     return solution_of(z[: len(qp.scale)], row, envelope, limit, *rest)
+
+
+def chorded_optimum(qp: CondensedQp, rows: np.ndarray, instance: QpInstance) -> float:
+    """With `position_weight`, for positions up to four steps away: squares are variables above all their chords."""
+    P, q, parts, _, _ = inequalities(qp, rows, instance)
+    weight, count, moves = np.asarray(qp.position_weight), P.shape[0], len(qp.scale)
+    paid = np.flatnonzero(weight)
+    P = P.tolil()
+    P[:moves, :moves] -= 2.0 * rows.T @ np.diag(weight) @ rows
+    reached = sp.hstack([rows[paid], sp.csr_matrix((len(paid), count - moves))])
+    G = [sp.hstack([matrix, sp.csr_matrix((matrix.shape[0], len(paid)))]) for matrix, _ in parts.values()]
+    h = [bound for _, bound in parts.values()]
+    for k in range(-5, 5):
+        G.append(sp.hstack([(2 * k + 1) * reached, -sp.identity(len(paid))]))
+        h.append(np.full(len(paid), k * (k + 1.0)))
+    G, h = sp.vstack(G, format="csr"), np.concatenate(h)
+    keep = np.isfinite(h)
+    P, q = sp.block_diag([P, sp.csc_matrix((len(paid),) * 2)], format="csc"), np.append(q, weight[paid])
+    z, _ = by_any(P, q, G[keep].tocsc(), h[keep])
+    return 0.5 * z @ (P @ z) + q @ z + (np.asarray(qp.quadratic) * instance.offset**2).sum()
 
 
 def by_clarabel(P, q, G, h):
