@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-LEAST = 1e-2  # of the largest share: smaller ones tighten next to nothing and leave the objective flatter
+LEAST = 1e-2  # of the curvature of a position: shares below it tighten next to nothing and leave the objective flatter
+SHARE = 0.9  # of what could be moved: the rest keeps the objective curved, so that few Newton steps solve it
 SAFE = 1e-9  # share of the curvature that stays, so that rounding leaves the objective convex
 
 
@@ -64,7 +65,7 @@ def chord_weights(curvature: Float[np.ndarray, "position position"]) -> Float[np
         return nothing
     found = np.where(found > LEAST, found, 0.0)
     found = _convex_share(scaled, found) * found
-    return 0.9 * np.where(found > LEAST, found, 0.0) * unit**2
+    return SHARE * np.where(found > LEAST, found, 0.0) * unit**2
 
 
 def _convex_share(curvature: np.ndarray, found: np.ndarray) -> float:
