@@ -101,6 +101,7 @@ def test_newton_finds_what_another_solver_finds_and_from_nonsense_the_same(batch
         x=random(instances.lower, 10),
         row_price=random(instances.offset, 100),
         envelope_price=jnp.zeros((LANES, *qp.steep.shape)),
+        position_price=jnp.zeros((LANES, 0)),
         limit_price=random(instances.limit_high, 100),
         box_price=random(instances.lower, 1e4),
         hard_price=random(instances.row_low, 1e4),
