@@ -8,7 +8,7 @@ from jaxmpc.programs.lanes import Lanes
 from jaxmpc.programs.packing import Packing, flattened, rebuilt
 from jaxmpc.relaxed.newton import WarmStart
 
-SHAPES = ((4,), (7,), (2, 4), (3,), (6,), (4,), (2,))  # of moves and prices
+SHAPES = ((4,), (7,), (2, 4), (2,), (6,), (4,), (2,))  # of moves and prices
 
 
 def tree():
