@@ -252,8 +252,11 @@ class _Tree:
         radius = self._radii(model)
         gain = np.where(np.isfinite(radius), 0.5 * away**2 / radius, 0.0)
         moves = rows[rows < count]
-        gain[0, moves] += model.excess[moves, cut[moves] - model.lower[moves]]
-        gain[1, moves] += model.excess[moves, cut[moves] + 1 - model.lower[moves]]
+        # the least of a side: with prices of chords the center need not be where nothing is left out
+        down = np.minimum.accumulate(model.excess, axis=1)
+        up = np.minimum.accumulate(model.excess[:, ::-1], axis=1)[:, ::-1]
+        gain[0, moves] += down[moves, cut[moves] - model.lower[moves]]
+        gain[1, moves] += up[moves, cut[moves] + 1 - model.lower[moves]]
         estimate = gain.copy()
         for kind in (slice(0, count), slice(count, None)):
             total, seen = self.gains[:, kind].sum(axis=1), self.seen[:, kind].sum(axis=1)

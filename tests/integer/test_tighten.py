@@ -5,59 +5,19 @@ import numpy as np
 import pytest
 
 from jaxmpc import status
-from jaxmpc.integer import branch_and_bound, enumeration, lower_bound
+from jaxmpc.integer import branch_and_bound, enumeration, lower_bound, solve
+from jaxmpc.integer.branch_and_bound import _Node, _Tree
 from jaxmpc.integer.cuts import Cuts
 from jaxmpc.integer.feasible import MoveLimits, needed, position_limits, satisfied, within
 from jaxmpc.integer.finish import finish_steps
 from jaxmpc.integer.lower_bound import enumerate_below
 from jaxmpc.integer.relaxer import Relaxer
-from jaxmpc.integer.tighten import LEAST, chord_weights
 from jaxmpc.relaxed.problem import evaluate
 from tests.integer.test_integer import one
 from tests.integer.tightened import SIZE, STEPS, Tightened
 from tests.oracles.foreign import chorded_optimum
 
 ACCURACY = 1e-7  # of objectives and bounds, relative: each is right to about 1e-8
-
-
-def curvatures(rng):
-    """Random curvatures of full rank, with one flat direction of all positions, and with flat ones of the last four."""
-    factor = rng.normal(size=(8, 8)) * 10 ** rng.uniform(-1, 1, size=(8, 1))
-    apart = np.zeros((8, 8))
-    apart[:4, :4] = factor[:4, :4] @ factor[:4, :4].T + np.diag(rng.uniform(1.0, 5.0, size=4))
-    apart[4:, 4:] = factor[4:, :2] @ factor[4:, :2].T
-    full = factor @ factor.T + np.diag(rng.uniform(0.0, 5.0, size=8))
-    return {"full": full, "flat": factor[:, :7] @ factor[:, :7].T, "apart": apart}
-
-
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("kind", ["full", "flat", "apart"])
-def test_chords_pay_all_curvature_that_leaves_the_objective_convex_but_a_tenth(kind, seed):
-    curvature = curvatures(np.random.default_rng(seed))[kind]
-    weight, top = chord_weights(curvature), np.diag(curvature).max()
-    least = lambda weight: np.linalg.eigvalsh(curvature - 2.0 * np.diag(weight))[0]  # noqa: E731
-    rounding = 1e-13 * np.trace(curvature)  # of eigenvalues
-    assert (weight >= 0.0).all()
-    assert least(weight) >= -rounding
-    assert weight.any() == (kind != "flat")
-    if kind == "apart":  # flat directions of other positions take nothing away
-        alone = chord_weights(curvature[:4, :4])
-        np.testing.assert_allclose(
-            weight[:4], alone, rtol=0.0, atol=1e-4 * top
-        )  # as below, of another programme
-    if (weight > 0.0).all():
-        assert least(1.12 * weight) < -rounding  # nine tenths are taken: 1 / 0.9 = 1.111 times as much is all
-    # shares below LEAST are left out, whose sum is what another may be raised by; the rest is what the solver leaves
-    noticeable = ((weight == 0.0).sum() * LEAST + 1e-3) * top
-    for raised in np.eye(len(weight)) * noticeable:
-        assert least(weight / 0.9 + raised) < -rounding
-    # the interior-point solver stops at 1e-8 of the sum, which is flat: single weights are less exact
-    scaled = chord_weights(1e3 * curvature)
-    np.testing.assert_allclose(scaled, 1e3 * weight, rtol=0.0, atol=1e3 * 1e-5 * weight.max())
-
-
-def test_no_curvature_leaves_nothing_for_chords():
-    assert not chord_weights(np.zeros((3, 3))).any()
 
 
 @pytest.fixture(scope="module")
@@ -139,6 +99,24 @@ def test_what_a_tightened_relaxation_proves_holds_at_every_whole_point_of_its_li
             assert (cuts.bounds(points) <= there + slack).all()
 
 
+def test_what_branching_is_said_to_gain_holds_at_every_whole_point_of_both_children(problems):
+    rng = np.random.default_rng(5)
+    for problem, values in problems:
+        search, tree = problem.search, _Tree(problem.search, Cuts(problem.constants))
+        reached = problem.points @ tree.rows.T
+        for limits in (problem.narrowed(rng) for _ in range(12)):
+            own = limits.lane(0)
+            rows = needed(search.chains, limits)
+            result = problem.relaxed(limits.lower, limits.upper, None, rows)
+            model = search.lower_model(result, 0, own.lower, own.upper)
+            inside = satisfied(within(search.chains, own), problem.points, own.lower, own.upper)
+            for branching in tree._branchings(_Node(model.value, own, model, result.start(0))):
+                down = reached[:, branching.row] <= branching.cut
+                for side, gain in zip((down, ~down), branching.estimate, strict=True):
+                    least = values[inside & side].min(initial=np.inf)
+                    assert model.value + gain <= least + ACCURACY * max(least, 1.0)
+
+
 def test_cuts_of_tightened_problems_at_whole_points_hold_at_all_and_touch_their_own(problems):
     for problem, values in problems:
         some = problem.points[:: max(len(problem.points) // 6, 1)]
@@ -170,9 +148,10 @@ def test_where_lists_are_too_long_the_tightened_tree_finds_the_best_plan_and_pro
 ):
     monkeypatch.setattr(lower_bound, "GRID", 0)
     monkeypatch.setattr(enumeration, "MOST", 1)
+    monkeypatch.setattr(solve, "HIGHS_SECONDS", 0.0, raising=False)
     if lists == "none at all":
-        monkeypatch.setattr(branch_and_bound, "LISTED", 0)
-    used = []
+        monkeypatch.setattr(branch_and_bound, "LISTED", 1)
+    used, by = [], []
     with_chords = Relaxer.with_chords
     monkeypatch.setattr(Relaxer, "with_chords", lambda *own: used.append(own) or with_chords(*own))
     for problem, values in problems:
@@ -189,9 +168,10 @@ def test_where_lists_are_too_long_the_tightened_tree_finds_the_best_plan_and_pro
         assert result.status == status.OPTIMAL
         assert result.value == pytest.approx(best, rel=1e-6, abs=slack)
         assert result.bound <= best + slack
-        assert result.value - result.bound <= 1e-6 * max(
-            result.value, 1e-6 * problem.constants.scale
-        )  # the gap
+        least = 1e-6 * problem.constants.scale  # below it gaps are relative to it
+        assert result.value - result.bound <= 1e-6 * max(result.value, least)
         point = np.round(result.x[problem.constants.integer]).astype(int)
         assert satisfied(problem.search.chains, point[None], problem.low, problem.high)[0]
+        by.append(result.finished_by)
     assert len(used) >= len(problems) // 2
+    assert by.count("branch-and-bound") >= len(problems) // 2
