@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jaxmpc import status
-from jaxmpc.integer import branch_and_bound, enumeration, lower_bound, solve
+from jaxmpc.integer import branch_and_bound, enumeration, lower_bound
 from jaxmpc.integer.branch_and_bound import _Node, _Tree
 from jaxmpc.integer.cuts import Cuts
 from jaxmpc.integer.feasible import MoveLimits, needed, position_limits, satisfied, within
@@ -148,7 +148,6 @@ def test_where_lists_are_too_long_the_tightened_tree_finds_the_best_plan_and_pro
 ):
     monkeypatch.setattr(lower_bound, "GRID", 0)
     monkeypatch.setattr(enumeration, "MOST", 1)
-    monkeypatch.setattr(solve, "HIGHS_SECONDS", 0.0, raising=False)
     if lists == "none at all":
         monkeypatch.setattr(branch_and_bound, "LISTED", 1)
     used, by = [], []
