@@ -23,7 +23,8 @@ from jaxmpc.integer.tables import Constants
 from jaxmpc.problem.instance import QpInstance
 from jaxmpc.problem.memory import check_ranges
 from jaxmpc.programs.clock import Clock
-from jaxmpc.status import LIMIT
+from jaxmpc.relaxed.gap import closes
+from jaxmpc.status import LIMIT, OPTIMAL
 
 WIDEST_ENVELOPE = 4  # steps up to which the envelope of the squared integer move is built
 
@@ -93,8 +94,14 @@ def _tightened(
         starts = [*starts, whole(found.x[own.scenario(0).integer])]
     (result,) = solve_integers(own, one, root, starts=[starts], spent=found.seconds + clock.seconds, **rest)
     result.nodes, result.root = result.nodes + found.nodes, found.root
-    if result.bound < found.bound <= result.value:
-        result.bound = found.bound
+    bound = max(result.bound, found.bound)
+    if found.value < result.value:  # time ran out before the second search came so far
+        result.x, result.value = found.x, found.value
+    result.bound = min(bound, result.value)
+    closed = closes(result.value, result.bound, own.scenario(0).scale, rest["gap"])
+    if result.x is not None and closed != (result.status == OPTIMAL):
+        by = result.finished_by or "branch-and-bound"
+        result.status, result.finished_by = (OPTIMAL, by) if closed else (LIMIT, None)
     return result
 
 

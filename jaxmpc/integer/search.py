@@ -51,9 +51,13 @@ class Relaxed(NamedTuple):
     steps: Array
 
 
-def relax(qp: CondensedQp, instance: QpInstance, lower, upper, start: WarmStart) -> Relaxed:
-    """Relax one problem within limits of the moves, and evaluate its moves with the integer ones rounded."""
+def relax(
+    qp: CondensedQp, instance: QpInstance, lower, upper, start: WarmStart, integers: bool = True
+) -> Relaxed:
+    """Relax one problem within limits of the moves, and evaluate its moves with the integer ones, if any, rounded."""
     s = solve_lane(qp, instance, lower, upper, start)
+    if not integers:
+        return Relaxed(warm_start_of(s), s.objective, s.bound, s.objective, s.status, s.iterations)
     snapped = jnp.where(qp.whole, jnp.round(s.x), s.x)
     w = qp.rows.of(snapped)
     fit = jnp.all((w <= instance.row_high + ROW_ROUNDING) & (w >= instance.row_low - ROW_ROUNDING))
@@ -123,9 +127,10 @@ def decide(
 
     def visit(state: _State) -> _State:
         """Solve what is next, and choose what to solve after it."""
-        result = relax(qp, instance, state.lower, state.upper, state.root.warm)
+        integers = tables.column.shape[0] > 0
+        result = relax(qp, instance, state.lower, state.upper, state.root.warm, integers)
         state = state._replace(solved=state.solved + 1, steps=state.steps + result.steps)
-        if not tables.column.shape[0]:
+        if not integers:
             return search.begun(state, result)
         return jax.lax.cond(state.solved == 1, search.begun, search.after, state, result)
 
