@@ -110,20 +110,14 @@ class _Tree:
     def __init__(self, search: Search, cuts: Cuts):
         self.search, self.cuts = search, cuts
         count = len(search.constants.integer)
-        self.reach = np.zeros((count, count))  # row i: the position after move i
-        for chain in search.chains:
-            size = len(chain.columns)
-            self.reach[np.ix_(chain.columns, chain.columns)] = np.tri(size) * chain.counts
-        self.rows = np.concatenate([np.eye(count), self.reach])
+        self.rows = np.concatenate([np.eye(count), search.constants.reached])
         self.gains, self.seen = np.zeros((2, 2 * count)), np.zeros((2, 2 * count), dtype=int)
         self.heap: list[tuple[float, int, _Node]] = []
         self.next: _Node | None = None  # the child that is followed
         self.number = itertools.count()
         self.held = 0
-
-        self.list_up_to = (
-            np.log(LISTED) + HOPED
-        )  # logarithm of the estimated size up to which a list is tried
+        # logarithm of the estimated size up to which a list is tried
+        self.list_up_to = np.log(LISTED) + HOPED
         self.polished = np.inf  # value of the incumbent whose neighbours were solved
         self.radii_of: dict[bytes, np.ndarray] = {}
 
@@ -212,7 +206,7 @@ class _Tree:
         lower, upper = exclude(dataclasses.replace(model, radius=radius[:count]), cutoff)
         left = max(cutoff - model.value, 1e-300)
         room = np.sqrt(2.0 * left * radius[count:])
-        position = self.reach @ model.center
+        position = search.constants.reached @ model.center
         low, high = position - room, position + room
         prices = model.positions
         if prices is not None:
@@ -336,9 +330,8 @@ class _Tree:
         if child.solved is None:
             return np.inf
         result, lane = child.solved
-        bound = max(
-            node.model.value + branching.estimate[side], float(result.bound[lane])
-        )  # NaN is not larger
+        # NaN is not larger
+        bound = max(node.model.value + branching.estimate[side], float(result.bound[lane]))
         self._learn(node, branching, side, bound)
         if (limits.lower < limits.upper).any():
             return bound
@@ -358,7 +351,7 @@ class _Tree:
         # a relaxation that did not get to its end may know less than its parent's prices, which hold here, too
         if np.isfinite(result.x[lane]).all() and result.bound[lane] >= parent.model.value:
             model = self.search.lower_model(result, lane, child.limits.lower, child.limits.upper)
-            model = model.priced(result.hard[lane][self.search.position_rows], child.limits)
+            model = model.priced(result.hard[lane][self.search.constants.position], child.limits)
             start = result.start(lane)
         return _Node(bound, tight.lane(0), model, start)
 

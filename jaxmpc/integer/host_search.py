@@ -120,12 +120,6 @@ class Search:
         self.left_out = min(self.left_out, bound)
 
     # ---- relaxations
-    @property
-    def position_rows(self) -> np.ndarray:
-        """Hard row of the position after every integer move."""
-        integer, size = self.constants.integer, self.constants.size
-        return integer // size.blocks * size.rows + integer % size.blocks
-
     def relax(
         self,
         lower: np.ndarray,
@@ -147,7 +141,7 @@ class Search:
         limits = LaneLimits(*(np.repeat(v[None], count, axis=0) for v in own))
         limits.lower[:, integer], limits.upper[:, integer] = lower, upper
         if positions is not None:
-            rows = self.position_rows
+            rows = self.constants.position
             limits.row_low[:, rows] = np.where(positions[0] > -UNBOUNDED, positions[0], -np.inf)
             limits.row_high[:, rows] = np.where(positions[1] < UNBOUNDED, positions[1], np.inf)
         if starts is None:

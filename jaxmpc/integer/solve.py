@@ -103,7 +103,7 @@ def _line(search: Search, starts: Sequence[np.ndarray], finish: str, last: bool)
         return search.finish(None, root_bound)
     model, lower, upper = search.lower_model(root, 0, low, high), low, high
     own = MoveLimits(low, high, *position_limits(search.chains))
-    model = model.priced(root.hard[0][search.position_rows], own)
+    model = model.priced(root.hard[0][c.position], own)
     point = np.clip(whole(model.center), low, high)
     if not satisfied(search.chains, point[None], low, high)[0]:
         lower, upper, possible = (part[0] for part in propagate(search.chains, low[None], high[None]))

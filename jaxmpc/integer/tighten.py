@@ -44,9 +44,8 @@ def chord_weights(curvature: Float[np.ndarray, "position position"]) -> Float[np
     unit = np.where(size > 0.0, size, 1.0)
     scaled = curvature / np.outer(unit, unit)
     worth = unit**2 / unit.max() ** 2
-    rows, columns = np.triu_indices(
-        len(size)
-    )  # the cone wants columns of the upper triangle one after the other
+    # the cone wants columns of the upper triangle one after the other
+    rows, columns = np.triu_indices(len(size))
     rank = np.lexsort((rows, columns))
     rows, columns = rows[rank], columns[rank]
     weights = np.where(rows == columns, 1.0, np.sqrt(2.0))

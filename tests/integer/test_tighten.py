@@ -87,7 +87,7 @@ def test_what_a_tightened_relaxation_proves_holds_at_every_whole_point_of_its_li
             bound += model.excess[np.arange(len(own.lower)), points - own.lower].sum(axis=1)
             assert (bound <= there + slack).all()
             assert bound.min() >= result.bound[0] - slack.max()  # and it is no looser than the relaxation
-            priced = model.priced(result.warm.hard_price[0][search.position_rows], own)
+            priced = model.priced(result.hard[0][search.constants.position], own)
             listed, bounds, _ = enumerate_below(
                 priced, within(search.chains, own), own.lower, own.upper, np.inf, None
             )
