@@ -420,10 +420,8 @@ class _Tree:
 
     def _solve(self, points: np.ndarray, bounds: np.ndarray | None = None) -> Steps:
         """Solve whole moves, each for a cut and perhaps an incumbent."""
-        result = yield from self.search.evaluate(points, bounds)
+        yield from self.cuts.solve(self.search, points, bounds)
         self.search.nodes += len(points)
-        for lane, point in enumerate(points):
-            self.cuts.add(result, lane, point, point)
 
     def _listed(self, node: _Node) -> Steps:
         """Close a node by listing what its level set leaves; returns whether that was done."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxmpc.integer.host_search import Search, Steps
 from jaxmpc.integer.relaxer import Relaxations
 from jaxmpc.integer.tables import Constants
 
@@ -51,6 +52,12 @@ class Cuts:
         cut = cut_of(self.constants, result, lane, lower, upper)
         if np.isfinite(cut[0]) and np.isfinite(cut[2]).all():
             self.list.append(cut)
+
+    def solve(self, search: Search, points: np.ndarray, bounds: np.ndarray | None = None) -> Steps:
+        """Solve whole moves ``"point integer"`` of known bounds, each for an incumbent and a cut."""
+        result = yield from search.evaluate(points, bounds)
+        for lane, point in enumerate(points):
+            self.add(result, lane, point, point)
 
     def bounds(self, points: Int[np.ndarray, "point integer"], first: int = 0) -> Float[np.ndarray, " point"]:
         """Lower bound of V at whole moves, by all cuts from number `first` on."""

@@ -65,10 +65,8 @@ def enumerate_all(
         rank = np.argsort(bounds, kind="stable")
         chosen, rest = rank[:size], rank[size:]
         known = len(cuts.list)
-        result = yield from search.evaluate(points[chosen], bounds[chosen])
+        yield from cuts.solve(search, points[chosen], bounds[chosen])
         search.nodes += len(chosen)
-        for lane, point in enumerate(points[chosen]):
-            cuts.add(result, lane, point, point)
         points, bounds = points[rest], bounds[rest]
         bounds = np.maximum(bounds, cuts.bounds(points, known))
         rounds += 1

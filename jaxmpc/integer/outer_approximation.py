@@ -151,7 +151,5 @@ def _solve_candidates(search: Search, cuts: Cuts, points: np.ndarray, limit: flo
         if not len(points):
             return
         best = points[np.argsort(bounds, kind="stable")[:GROUP]]
-        result = yield from search.evaluate(best)
+        yield from cuts.solve(search, best)
         search.nodes += len(best)
-        for lane, point in enumerate(best):
-            cuts.add(result, lane, point, point)

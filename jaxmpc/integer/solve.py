@@ -158,9 +158,7 @@ def _solve_all(search: Search, cuts: Cuts, points: Sequence[np.ndarray]) -> Step
     """Solve whole moves that are new, each for an incumbent and a cut."""
     fresh = search.new(points)
     if len(fresh):
-        result = yield from search.evaluate(fresh)
-        for lane, point in enumerate(fresh):
-            cuts.add(result, lane, point, point)
+        yield from cuts.solve(search, fresh)
 
 
 def _repaired(search: Search, model: LowerModel, lower: np.ndarray, upper: np.ndarray) -> np.ndarray | None:
