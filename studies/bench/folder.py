@@ -25,7 +25,7 @@ from studies.bench.context import Context
 from studies.bench.generate import OPTIMA, shipped_cases
 from studies.bench.judge import FEASIBLE, repeated, tolerated
 from studies.bench.problem import objective, violation
-from studies.bench.rows import Found, Row, timed
+from studies.bench.rows import Found, Row
 from studies.definition.refusing import located, require
 
 TRUTH = "truth.json"
@@ -53,9 +53,8 @@ def shipped(processes: tuple[str, ...] = ()) -> tuple[dict[str, Case], dict[str,
     """The shipped instances and what is known of them; of some processes alone the first of every family."""
     cases = shipped_cases()
     first = [name for name in cases if name.split("_")[0] in processes and name.endswith("_0")]
-    return {name: cases[name] for name in first or cases}, msgspec.json.decode(
-        OPTIMA.read_bytes(), type=dict[str, Known]
-    )
+    known = msgspec.json.decode(OPTIMA.read_bytes(), type=dict[str, Known])
+    return {name: cases[name] for name in first or cases}, known
 
 
 def write(folder: Path, cases: dict[str, dict], known: dict[str, Known]) -> None:
@@ -124,19 +123,8 @@ def found(
         seconds, plan = solve(case, context.size.cut_off)
         wrong = faults(body, entry, plan)
         answer = {key: getattr(plan, key) for key in ("status", "objective", "gap", "finished_by")}
-        yield timed(
-            name,
-            [seconds],
-            [math.nan if plan.moves is None or plan.status != "optimal" else 0.0],
-            **{
-                "p99_ms": None,
-                "rate": None,
-                "worst_error": None,
-                "counts": not wrong,
-                "note": "; ".join(wrong),
-            },
-            found=Found(**answer, best=entry.objective, certified=entry.optimum is not None),
-        )
+        best = Found(**answer, best=entry.objective, certified=entry.optimum is not None)
+        yield Row(name=name, seconds=seconds, counts=not wrong, note="; ".join(wrong), found=best)
 
 
 def faults(case: dict, known: Known, plan: Plan) -> list[str]:

@@ -276,7 +276,7 @@ def test_batches_have_rates_and_figures(cache, tmp_path):
 
 
 def test_the_foreign_section_has_a_row_per_solver_and_their_times():
-    tiny = dataclasses.replace(TINY, foreign=("quadtank",))
+    tiny = dataclasses.replace(TINY, foreign=("quadtank",), cut_off=60.0)
     scip = peers.MIQP_PEERS[0]
     lost = dataclasses.replace(
         peer("Lost", bounds=True),
