@@ -160,7 +160,11 @@ def certified(context: Context, case: Case) -> Known:
             except Exception as error:  # what a licence does not cover, or tolerances break
                 context.say(f"{peer.name}: {error}")
                 continue
-            ways[f"{peer.name} {peer.version()}"] = answer.status, polished(body, moves), answer.bound
+            ways[f"{peer.name} ({peer.package} {peer.version()})"] = (
+                answer.status,
+                polished(body, moves),
+                answer.bound,
+            )
     costs = {who: objective(body, moves) for who, (_, moves, _) in ways.items() if moves is not None}
     costs = {who: cost for who, cost in costs.items() if violation(body, ways[who][1]) <= FEASIBLE}
     if not costs:
