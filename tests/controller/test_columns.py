@@ -78,7 +78,7 @@ def test_every_way_to_finish_is_exact(name, blocking, finish):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("twist", SLOW_SITUATIONS)
-@pytest.mark.parametrize("name", COLUMNS)
+@pytest.mark.parametrize("name", ["horizon of one move", "horizons within own blocks"])
 def test_steps_are_optimal_in_every_situation(name, twist):
     for seed, blocking in enumerate(("moves", "inputs")):
         assert complaints(columns_case(100 + seed, name, blocking, twist), "auto") == []
@@ -267,7 +267,7 @@ def test_horizons_of_one_size_are_lanes_of_one_batch(small_structure, well_like_
             assert np.abs(steps - np.round(steps))[:whole].max() < 1e-9
 
 
-@pytest.mark.parametrize("blocking", ["moves", "inputs"])
+@pytest.mark.parametrize("blocking", ["moves", pytest.param("inputs", marks=pytest.mark.slow)])
 def test_a_loop_moves_by_whole_steps_and_its_plans_end_relaxed(
     small_structure, well_like_model, thesis_fields, blocking
 ):
