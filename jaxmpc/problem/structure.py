@@ -136,7 +136,7 @@ class Structure:
     def _checked_horizon(self) -> tuple[int | None, ...]:
         """Integer horizons of the MVs, None for continuous ones and for the whole control horizon."""
         given: Any = self.integer_horizon
-        if given is None or is_number(given):
+        if given is None or isinstance(given, bool) or is_number(given):
             given = (given,) * self.mv_count
         horizons = tuple(given) or (None,) * self.mv_count
         if len(horizons) != self.mv_count:
@@ -146,8 +146,8 @@ class Structure:
             if horizon is not None and not is_count(horizon):
                 expected = "a whole number of samples, 1 or more"
                 raise InputError(f"structure.integer_horizon.{name}", horizon, expected)
-        steps = zip(horizons, self.integer_step, strict=True)
-        return tuple(None if horizon is None or step is None else int(horizon) for horizon, step in steps)
+        integer = self.integer_mvs
+        return tuple(None if h is None or mv not in integer else int(h) for mv, h in enumerate(horizons))
 
     @property
     def cv_count(self) -> int:
@@ -177,7 +177,7 @@ class Structure:
     def whole_blocks(self, mv: int) -> int:
         """Number of blocks of one MV whose moves are whole: its first ones, none where it is continuous."""
         blocks, horizon = self.blocks_of(mv), self.integer_horizon[mv]
-        if self.integer_step[mv] is None:
+        if mv not in self.integer_mvs:
             return 0
         starts = itertools.accumulate(blocks[:-1], initial=0)
         return len(blocks) if horizon is None else sum(start < horizon for start in starts)

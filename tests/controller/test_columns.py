@@ -360,3 +360,5 @@ def test_horizons_of_continuous_mvs_say_nothing():
     assert structure.relaxed() == Structure(**names)
     with pytest.raises(InputError, match="2 entries, one per MV"):
         Structure(**names, integer_horizon=(1, 2, 3))
+    with pytest.raises(InputError, match="a whole number of samples"):
+        Structure(**names, integer_horizon=True)
