@@ -146,7 +146,7 @@ class _Proximal(NamedTuple):
         p = problem
         row = stiffness * p.qp.row_unit
         of_one = stiffness / jnp.maximum(p.qp.rows.size, TINY)
-        hard = p.qp.rows.spread(of_one, p.row_low.shape[0] // of_one.shape[0])
+        hard = p.qp.rows.spread(of_one, p.row_low.shape[0] // of_one.shape[-1])
         limit = p.limit_high  # none
         if p.qp.has_limits:
             # a limit that costs much has far to go with its price
