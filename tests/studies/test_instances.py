@@ -16,6 +16,7 @@ from jaxmpc.errors import InputError
 from studies.bench import folder, peers, run
 from studies.bench.context import QUICK, Context
 from studies.bench.folder import Known, faults, shipped, solve
+from studies.bench.forms import lifted
 from studies.bench.generate import step_response
 from studies.bench.judge import FEASIBLE, Judge, performance_profile
 from studies.bench.problem import objective, violation
@@ -214,6 +215,14 @@ def test_an_optimum_that_one_solver_proves_is_open():
         assert known.open
         assert known.optimum is None
         assert known.objective == pytest.approx(KNOWN[ONE].objective, rel=1e-7)
+
+
+@pytest.mark.parametrize("own", [{"integer_horizon": 2}, {"blocks": {"pump 1": [8], "pump 2": [1, 7]}}])
+def test_structures_that_other_solvers_are_not_given_are_refused(own):
+    case = case_to_dict(CASES[ONE])
+    case["structure"] |= own
+    with pytest.raises(InputError, match="no integer_horizon"):
+        lifted(case)
 
 
 def test_a_certified_optimum_is_what_plans_are_judged_by():
