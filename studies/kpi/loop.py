@@ -1,14 +1,16 @@
 """Key figures of a closed loop, as pure functions of arrays (time axis first).
 
 Everything here is `jax.numpy` on fixed shapes, so `jax.vmap` turns it into the key figures of thousands
-of scenarios; plain numpy arrays go in just as well. Notation: y measured CV, r setpoint, u actuator
-position, k the sample, dt the sampling interval, m[k] = u[k] - u[k-1] the move at sample k.
+of scenarios; plain numpy arrays go in just as well, and each figure is then one small program. Notation: y measured CV,
+r setpoint, u actuator position, k the sample, dt the sampling interval, m[k] = u[k] - u[k-1] the move at sample k.
 
 A *move* is an |m[k]| above a threshold. `MOVE_THRESHOLD` = 0.05 % keeps the creeping of a continuous choke
 out and every 2 % step in. A *reversal* is a move whose direction is opposite to the move before it.
 """
 
 from __future__ import annotations
+
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -31,21 +33,25 @@ Count = Int[Array, ""]
 Statistic = Float[Array, " cv"]
 
 
+@functools.partial(jax.jit, inline=True)
 def moves_of(position: Samples, start) -> Float[Array, " sample"]:
     """m[0] = u[0] - start, m[k] = u[k] - u[k-1]; `start` is the position before the run, same unit."""
     return jnp.diff(jnp.asarray(position), prepend=jnp.asarray(start)[None])
 
 
+@functools.partial(jax.jit, inline=True)
 def travel(move: Samples) -> Number:
     """Travel sum_k |m[k]|, in the unit of the move: the wear of a choke, in %."""
     return jnp.abs(jnp.asarray(move)).sum()
 
 
+@functools.partial(jax.jit, inline=True)
 def move_count(move: Samples, threshold: float = MOVE_THRESHOLD) -> Count:
     """Number of samples with |m[k]| > threshold."""
     return (jnp.abs(jnp.asarray(move)) > threshold).sum()
 
 
+@functools.partial(jax.jit, inline=True)
 def reversal_events(
     move: Samples, threshold: float = MOVE_THRESHOLD, segment: Labels | None = None
 ) -> Bool[Array, " sample"]:
@@ -70,6 +76,7 @@ def _before(event: Bool[Array, " sample"]) -> Int[Array, " sample"]:
     return jnp.concatenate([jnp.full((1,), -1, latest.dtype), latest[:-1]])
 
 
+@functools.partial(jax.jit, static_argnames="segments", inline=True)
 def count_by_segment(
     event: Bool[ArrayLike, " sample"], segment: Labels, segments: int
 ) -> Int[Array, " segment"]:
@@ -91,6 +98,7 @@ def second_halves(window: Int[np.ndarray, " sample"]) -> Int[np.ndarray, " sampl
     return out
 
 
+@functools.partial(jax.jit, inline=True)
 def dwell(move: Samples, dt: float, threshold: float = MOVE_THRESHOLD) -> tuple[Number, Number]:
     """Mean and shortest time between successive moves [s].
 
@@ -106,22 +114,26 @@ def dwell(move: Samples, dt: float, threshold: float = MOVE_THRESHOLD) -> tuple[
     return mean, jnp.where(count > 0, shortest, jnp.nan)
 
 
+@functools.partial(jax.jit, inline=True)
 def mean_absolute_deviation(cv: Cvs, setpoint: Cvs) -> Statistic:
     """mean_k |y[k] - r[k]| [CV unit]."""
     return jnp.abs(jnp.asarray(cv) - jnp.asarray(setpoint)).mean(axis=0)
 
 
+@functools.partial(jax.jit, inline=True)
 def integral_absolute_error(cv: Cvs, setpoint: Cvs, dt: float) -> Statistic:
     """IAE = dt sum_k |y[k] - r[k]| [CV unit s]."""
     return dt * jnp.abs(jnp.asarray(cv) - jnp.asarray(setpoint)).sum(axis=0)
 
 
+@functools.partial(jax.jit, inline=True)
 def time_outside_deadzone(cv: Cvs, setpoint: Cvs, deadzone: PerCv, dt: float) -> Statistic:
     """Time with |y[k] - r[k]| > c [s], c the half width of the deadzone: dt times the number of samples."""
     outside = jnp.abs(jnp.asarray(cv) - jnp.asarray(setpoint)) > jnp.asarray(deadzone)
     return dt * outside.sum(axis=0)
 
 
+@functools.partial(jax.jit, inline=True)
 def limit_excess(
     value: Values, low: Limits, high: Limits, tolerance: Limits | float = 0.0
 ) -> Float[Array, "sample channel"]:
@@ -131,6 +143,7 @@ def limit_excess(
     return jnp.where(excess <= jnp.asarray(tolerance), 0.0, excess)
 
 
+@functools.partial(jax.jit, inline=True)
 def limit_violations(
     value: Values, low: Limits, high: Limits, tolerance: Limits | float = 0.0
 ) -> Int[Array, " channel"]:
@@ -138,6 +151,7 @@ def limit_violations(
     return (limit_excess(value, low, high, tolerance) > 0).sum(axis=0)
 
 
+@functools.partial(jax.jit, inline=True)
 def largest_excess(
     value: Values, low: Limits, high: Limits, tolerance: Limits | float = 0.0
 ) -> Float[Array, " channel"]:
@@ -145,11 +159,13 @@ def largest_excess(
     return limit_excess(value, low, high, tolerance).max(axis=0)
 
 
+@functools.partial(jax.jit, inline=True)
 def volume(rate: Samples, dt: float) -> Number:
     """Integral of a rate that is held from sample to sample, dt / 3600 sum_k q[k]: m3/h gives m3."""
     return dt / 3600.0 * jnp.asarray(rate).sum()
 
 
+@functools.partial(jax.jit, inline=True)
 def closed_loop_cost(
     cv: Cvs,
     setpoint: Cvs,
@@ -174,6 +190,7 @@ def closed_loop_cost(
     return ((tracking + soft).sum(axis=1) + moves.sum(axis=1)).mean()
 
 
+@functools.partial(jax.jit, static_argnames="samples", inline=True)
 def windowed_mean(move: Samples, samples: int) -> Float[Array, " sample"]:
     """Mean of the last n = `samples` moves up to and including k (6.6); moves before the run are zero."""
     total = jnp.cumsum(jnp.asarray(move))
@@ -181,6 +198,7 @@ def windowed_mean(move: Samples, samples: int) -> Float[Array, " sample"]:
     return (total - earlier) / samples
 
 
+@functools.partial(jax.jit, static_argnames="samples", inline=True)
 def mean_move_stops(move: Samples, samples: int, limit: float, threshold: float = MOVE_THRESHOLD) -> Count:
     """Steps of the staircase: how often opening pauses because the windowed mean is above its limit.
 
@@ -194,6 +212,7 @@ def mean_move_stops(move: Samples, samples: int, limit: float, threshold: float 
     return (paused & (windowed_mean(move, samples)[before] > limit)).sum()
 
 
+@functools.partial(jax.jit, static_argnames="samples", inline=True)
 def opening_above_limit(move: Samples, samples: int, limit: float) -> Count:
     """Opening moves made although the mean of the `samples` moves before them was above `limit` (6.6).
 
@@ -204,6 +223,7 @@ def opening_above_limit(move: Samples, samples: int, limit: float) -> Count:
     return ((before > limit + 1e-6) & (move > 1e-6)).sum()
 
 
+@functools.partial(jax.jit, inline=True)
 def solve_time_statistics(solve_time: Samples) -> Float[Array, " statistic"]:
     """Median, 99th percentile (linear interpolation) and largest solve time [s]; NaN if one is NaN."""
     value = jnp.asarray(solve_time, dtype=jnp.float64)
@@ -219,6 +239,7 @@ def solve_time_statistics(solve_time: Samples) -> Float[Array, " statistic"]:
     return jnp.where(jnp.isnan(value).any(), jnp.nan, found)
 
 
+@functools.partial(jax.jit, inline=True)
 def largest_gap(gap: Samples) -> Number:
     """Largest relative gap between objective and bound; infinite if a sample has none (NaN)."""
     gap = jnp.asarray(gap)

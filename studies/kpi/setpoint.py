@@ -7,6 +7,7 @@ stretch of samples with equal labels (`jaxmpc.loop.reference.Reference.window`);
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -25,6 +26,7 @@ class Settling(NamedTuple):
     unsettled: Int[Array, " cv"]  # how many of them end outside the tolerance
 
 
+@functools.partial(jax.jit, inline=True)
 def window_bounds(window: Labels) -> tuple[Int[Array, " sample"], Int[Array, " sample"]]:
     """First and last sample of the window that each sample is in."""
     window = jnp.asarray(window)
@@ -36,6 +38,7 @@ def window_bounds(window: Labels) -> tuple[Int[Array, " sample"], Int[Array, " s
     return start, jax.lax.cummin(last, reverse=True)
 
 
+@functools.partial(jax.jit, inline=True)
 def late_segment(start: Labels, end: Labels) -> Int[Array, " sample"]:
     """First sample of the window in its second half (from sample n // 2 of n), -1 elsewhere.
 
@@ -45,6 +48,7 @@ def late_segment(start: Labels, end: Labels) -> Int[Array, " sample"]:
     return jnp.where(jnp.arange(start.shape[0]) - start >= (end - start + 1) // 2, start, -1)
 
 
+@functools.partial(jax.jit, inline=True)
 def setpoint_change(cv: Cvs, setpoint: Cvs, tolerance: PerCv, start: Labels) -> Float[Array, "sample cv"]:
     """How much the setpoint changed when the window of each sample began [CV unit].
 
@@ -58,6 +62,7 @@ def setpoint_change(cv: Cvs, setpoint: Cvs, tolerance: PerCv, start: Labels) -> 
     return jnp.where((start == 0)[:, None], initial, later)
 
 
+@functools.partial(jax.jit, inline=True)
 def overshoot(cv: Cvs, setpoint: Cvs, change: Cvs) -> Float[Array, " cv"]:
     """Largest excursion beyond a new setpoint, max_k max(sign(d[k]) (y[k] - r[k]), 0) [CV unit].
 
@@ -70,6 +75,7 @@ def overshoot(cv: Cvs, setpoint: Cvs, change: Cvs) -> Float[Array, " cv"]:
     return jnp.where((change != 0).any(axis=0), largest, jnp.nan)
 
 
+@functools.partial(jax.jit, inline=True)
 def settling(
     cv: Cvs, setpoint: Cvs, change: Cvs, tolerance: PerCv, bounds: tuple[Labels, Labels], dt: float
 ) -> Settling:
