@@ -1,7 +1,6 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -31,6 +30,10 @@ def structure(**changes):
 
 
 _matrix = jax.jit(dynamic_matrix)
+_matrices = jax.jit(matrices_of, static_argnames="size")
+_rows = jax.jit(Rows.of_layout)
+_along = jax.jit(jax.vmap(Rows.of, in_axes=(None, 0)))
+_value = jax.jit(evaluate)
 
 
 def matrix_of(s: Structure, coefficients):
@@ -85,7 +88,7 @@ def test_hard_rows_say_what_the_samples_do(blocking):
     rng = np.random.default_rng(2)
     agree = {True: 0, False: 0}
     moves = rng.integers(-2, 3, size=(3000, 4))
-    for d, along in zip(moves, np.asarray(jax.vmap(rows.of)(jnp.asarray(moves, dtype=float))), strict=True):
+    for d, along in zip(moves, np.asarray(_along(rows, moves.astype(float))), strict=True):
         samples = sample_moves(s) @ d
         by_sample = np.abs(np.cumsum(samples)).max() <= 3 and np.abs(np.diff(samples)).max() <= 1
         by_rows = (
@@ -100,8 +103,7 @@ def test_hard_rows_say_what_the_samples_do(blocking):
 
 def rows_of(s: Structure, size: Size) -> Rows:
     """The hard rows of a structure in arrays of a size."""
-    layout = layout_of(s, size)
-    return Rows.of_layout(layout)
+    return _rows(layout_of(s, size))
 
 
 ROWS = {
@@ -193,7 +195,7 @@ def test_the_condensed_objective_is_the_objective_of_the_thesis():
             np.maximum((np.array([-np.inf, -0.5]) - y).max(0), 0),
         )
         value += (np.array([10.0, 5.0]) * (over + under)).sum()
-        assert float(evaluate(qp, instance, jnp.asarray(x.reshape(-1)))) == pytest.approx(value, rel=1e-12)
+        assert float(_value(qp, instance, x.reshape(-1))) == pytest.approx(value, rel=1e-12)
 
 
 def steady(s: Structure, tuning, **step):
@@ -249,12 +251,13 @@ def test_batched_weights_share_one_program():
     s = structure()
     size, tuning = Size.of(s, 5), make_tuning(s, cv_weight=1.0, move_weight=1.0)
     layout = layout_of(s, size)
-    ones = jnp.ones((2, 2, size.future))
+    ones = np.ones((2, 2, size.future))
 
     def make(gain):
         return condense(layout, size, tuning, matrices_of(layout, size, gain * ones))
 
-    both = jax.jit(jax.vmap(make))(jnp.asarray([1.0, 2.0]))
+    both = jax.jit(jax.vmap(make))(np.array([1.0, 2.0]))
+    both = jax.tree.map(np.asarray, both)
     np.testing.assert_allclose(
         both.theta[1], 2.0 * both.theta[0] * (both.scale[1] / both.scale[0]), rtol=1e-12
     )
@@ -286,8 +289,8 @@ def test_tunings_share_the_response_of_their_model():
     s = structure()
     size = Size.of(s, 9)
     layout = layout_of(s, size)
-    coefficients = jnp.asarray(over(np.random.default_rng(7).normal(size=(2, 2, 9)), size.future))
-    matrices = matrices_of(layout, size, coefficients)
+    coefficients = over(np.random.default_rng(7).normal(size=(2, 2, 9)), size.future)
+    matrices = _matrices(layout, size, coefficients)
 
     def constants(weight, limit):
         tuning = make_tuning(
@@ -301,7 +304,9 @@ def test_tunings_share_the_response_of_their_model():
 
     # `out_axes=None` is refused for anything that has a batch axis
     over_tunings = jax.jit(jax.vmap(constants, in_axes=(0, 0), out_axes=(None, 0, 0)))
-    (response, summed), scale, theta = over_tunings(jnp.asarray([1.0, 3.0]), jnp.asarray([1.0, 2.0]))
+    (response, summed), scale, theta = jax.tree.map(
+        np.asarray, over_tunings(np.array([1.0, 3.0]), np.array([1.0, 2.0]))
+    )
     assert response.shape == (size.cvs * size.horizon, size.moves)
     assert np.shape(summed) == (size.cvs * size.horizon, size.moves * (size.moves + 1) // 2)
     assert not np.allclose(scale[0], scale[1])
