@@ -39,7 +39,7 @@ def steady_map(
     plant = WellPlant() if plant is None else plant
     chokes = np.asarray(CHOKES if chokes is None else chokes)
     lifts = np.atleast_1d(LIFTS if lifts is None else lifts)
-    sweeps = [steady_sweep(plant, chokes, [lift]) for lift in lifts]  # one shape: compiled once for any grid
+    sweeps = [steady_sweep(plant, chokes, [lift]) for lift in lifts]  # a call of its program each
     cv = np.concatenate([np.where(sweep.converged, sweep.cv, np.nan) for sweep in sweeps], axis=1)
     kind, digest = identity(plant)
     return SteadyMap(

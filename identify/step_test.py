@@ -12,7 +12,6 @@ import itertools
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.errors import InputError
@@ -29,6 +28,7 @@ from jaxmpc.process.well.equations import (
 )
 
 SETTLE_SAMPLES = 60  # held at the working point before a step
+PIECE = 64  # samples of one call, so that all lengths are run by one program
 SETTLED_SHARE = 0.01  # of the largest coefficient; a settled response moves less over its last tenth
 
 
@@ -95,8 +95,13 @@ def apply_sequence(
         ``(cv, mv)``: measurements and applied inputs at the end of each sample, both ``"sample 2"``.
     """
     if isinstance(plant, WellPlant):
-        _, outputs = _run(plant, plant.init(choke, lift), jnp.asarray(demands))
-        return np.asarray(outputs.cv), np.asarray(outputs.mv)
+        state, pieces = plant.init(choke, lift), []
+        held = np.pad(demands, ((0, -len(demands) % PIECE), (0, 0)), mode="edge")
+        for begin in range(0, len(held), PIECE):
+            state, outputs = _run(plant, state, held[begin : begin + PIECE])
+            pieces.append((np.asarray(outputs.cv), np.asarray(outputs.mv)))
+        cv, mv = (np.concatenate(parts)[: len(demands)] for parts in zip(*pieces, strict=True))
+        return cv, mv
     plant.init(choke, lift)
     outputs = [plant.step(demand) for demand in demands]
     return np.array([o.cv for o in outputs]), np.array([o.mv for o in outputs])

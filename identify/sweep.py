@@ -1,7 +1,7 @@
 """Steady-state step coefficients over the choke range: thesis 4.1.1, figures 10 and 11.
 
 For each lift rate, the gain of a 2 % choke step from each choke position, computed from steady states. On the
-JAX well all steady states are solved in one batch; on the FMU each is settled by simulation.
+JAX well steady states are solved in batches; on the FMU each is settled by simulation.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -18,6 +17,7 @@ from jaxmpc.process.plant import WellPlant, check_inputs, steady_state
 from jaxmpc.process.well.equations import CV_NAMES
 
 LIFTS = (5000.0, 7500.0, 10000.0)  # m3/h, the three curves of figures 10 and 11
+POINTS = 50  # of one call, so that all grids are solved by one program
 
 
 class SteadySweep(NamedTuple):
@@ -41,8 +41,20 @@ class SteadySweep(NamedTuple):
     cv_names: tuple[str, ...] = CV_NAMES
 
 
-@jax.jit
 def _steady(choke, lift, parameters):
+    """Steady CVs ``"point cv"`` and whether they were found."""
+    found, padded = [], (0, -len(choke) % POINTS)
+    choke, lift = np.pad(choke, padded, mode="edge"), np.pad(lift, padded, mode="edge")
+    for begin in range(0, len(choke), POINTS):
+        some = slice(begin, begin + POINTS)
+        found.append(jax.tree.map(np.asarray, _some_steady(choke[some], lift[some], parameters)))
+    cv, converged = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    used = len(cv) - padded[1]
+    return cv[:used], converged[:used]
+
+
+@jax.jit
+def _some_steady(choke, lift, parameters):
     found = jax.vmap(lambda c, q: steady_state(c, q, 0.0, parameters))(choke, lift)
     return found.outputs.cv, found.converged
 
@@ -66,7 +78,7 @@ def steady_sweep(plant: Any = None, chokes: ArrayLike | None = None, lifts: Arra
     if chokes.ndim != 1 or len(chokes) < 2 or (np.diff(chokes) <= 0).any():
         raise InputError("chokes", chokes.tolist(), "two or more increasing positions [%]")
     if isinstance(plant, WellPlant):
-        cv, converged = _steady(jnp.asarray(choke), jnp.asarray(lift), plant.parameters)
+        cv, converged = _steady(choke, lift, plant.parameters)
     else:
         settled = [
             (plant.init(float(c), float(q)).cv, plant.settled) for c, q in zip(choke, lift, strict=True)

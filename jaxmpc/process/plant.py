@@ -174,7 +174,7 @@ def steady_state(
     return SteadyState(x, outputs, drifting <= STEADY_TOLERANCE, drifting, hours)
 
 
-_steady_state = jax.jit(steady_state)  # compiled once, whatever the plant
+steady_state_of = jax.jit(steady_state)  # of all arguments: compiled once, whatever the plant
 
 
 def _known(choke, lift, disturbance, parameters) -> bool:
@@ -236,7 +236,7 @@ class WellPlant(eqx.Module):
         if _known(choke, lift, disturbance, self.parameters):
             x = jnp.asarray(SHIPPED_STEADY_STATE, dtype=jnp.float64)
         else:
-            x = _steady_state(choke, lift, disturbance, self.parameters).x
+            x = steady_state_of(choke, lift, disturbance, self.parameters).x
         return WellState(x, jnp.asarray(choke, dtype=jnp.float64), jnp.asarray(lift, dtype=jnp.float64))
 
     def step(

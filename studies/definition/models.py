@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-import jax
-
 from identify.step_test import identify_step_response
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import StepResponseModel
-from jaxmpc.process.plant import check_inputs, steady_state
+from jaxmpc.process.plant import check_inputs, steady_state_of
+from jaxmpc.process.well.equations import WellParameters
 from studies.definition.refusing import require
 
 Point = tuple[float, float]
 STEPS = (2.0, 100.0)  # of the choke [%] and of the gas lift [m3/h]
 SAMPLES = 250  # coefficients of a model
-
-_steady_state = jax.jit(steady_state)
 
 
 def identify_models(
@@ -41,7 +38,7 @@ def identify_models(
         except InputError as error:
             expected = f"{error.expected}, also {STEPS[0]:g} % and {STEPS[1]:g} m3/h further"
             raise InputError(here, error.value, expected) from None
-        settles = _steady_state(choke, lift).converged
+        settles = steady_state_of(choke, lift, 0.0, WellParameters()).converged
         require(settles, here, "no steady state", "a working point at which the well settles")
     out = {}
     for choke, lift in wanted:

@@ -21,11 +21,13 @@ import identify.fmu as fmu_module
 from identify.fmu import FmuPlant, build_fmu, validate_fmu
 from identify.fmu_source import INPUT_SEQUENCE, fmu_files
 from jaxmpc.errors import InputError, MissingToolError
-from jaxmpc.process.plant import WellPlant, WellState, steady_state
+from jaxmpc.process.plant import WellPlant, WellState, steady_state_of
 from jaxmpc.process.well.equations import SHIPPED_STEADY_STATE, WellParameters
 from tests.process.test_plant import random_demands
 
 PLANT = WellPlant()
+run = jax.jit(PLANT.run)
+run_stepped = jax.jit(PLANT.with_actuator("step").run)
 
 
 @pytest.fixture(scope="module", params=[2, 3], ids=["FMI 2.0", "FMI 3.0"])
@@ -83,12 +85,13 @@ def test_fmu_agrees_with_the_jax_plant(plant, seed):
     # Even seeds cover the whole box with shut-ins; odd ones stay where the well swings.
     limits = {} if seed % 2 == 0 else {"lift_high": 2000.0}
     demands, offsets = random_demands(np.random.default_rng(seed), 1, 800, **limits)
-    _, expected = jax.jit(PLANT.run)(PLANT.init(), demands[0], offsets[0])
+    _, expected = run(PLANT.init(), demands[0], offsets[0])
+    expected = jax.tree.map(np.asarray, expected)
     plant.init()
     for i, (mv, offset) in enumerate(zip(demands[0], offsets[0], strict=True)):
         outputs = plant.step(mv, offset)
         for a, b in zip(outputs, expected, strict=True):
-            np.testing.assert_allclose(a, np.asarray(b)[i], rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(a, b[i], rtol=1e-9, atol=1e-9)
 
 
 def test_fmu_agrees_from_any_state(plant):
@@ -103,7 +106,7 @@ def test_fmu_agrees_from_any_state(plant):
 def test_step_choke_moves_alike_on_both_plants(path):
     demands = np.cumsum(np.random.default_rng(4).uniform(-1.5, 1.5, 200)) + 50.0
     mv = np.stack([demands, np.full(200, 7000.0)], axis=-1)
-    _, expected = jax.jit(PLANT.with_actuator("step").run)(PLANT.init(), mv)
+    _, expected = run_stepped(PLANT.init(), mv)
     with FmuPlant(path, actuator="step") as plant:
         positions = [plant.step(row).mv[0] for row in mv]
     np.testing.assert_array_equal(positions, expected.mv[:, 0])
@@ -113,7 +116,7 @@ def test_step_choke_moves_alike_on_both_plants(path):
 def test_settling_elsewhere_finds_the_steady_state(plant):
     outputs = plant.init(20.0, 5000.0, -2.0)
     assert plant.settled
-    expected = jax.jit(steady_state)(20.0, 5000.0, -2.0)
+    expected = steady_state_of(20.0, 5000.0, -2.0, WellParameters())
     np.testing.assert_allclose(outputs.cv, expected.outputs.cv, rtol=1e-8)
 
 
@@ -138,7 +141,7 @@ def test_built_in_sequence_drives_the_well_until_septic_control_is_set(path):
     starts = np.array([row[0] for row in INPUT_SEQUENCE])
     which = np.searchsorted(starts, result["time"][:-1] + 1e-6, side="right") - 1
     demands = np.array(INPUT_SEQUENCE)[which, 1:]
-    _, expected = jax.jit(PLANT.run)(PLANT.init(), demands)
+    _, expected = run(PLANT.init(), demands, np.zeros(len(demands)))
     np.testing.assert_allclose(result["oil_rate"][1:], expected.cv[:, 1], rtol=1e-9)
     held = fmpy.simulate_fmu(
         str(path),
@@ -282,7 +285,7 @@ def test_an_fmu_of_other_parameters_starts_in_their_steady_state(path, monkeypat
     with FmuPlant(build_fmu(2, tmp_path / "other.fmu", parameters)) as plant:
         first = plant.measure().cv
         np.testing.assert_allclose(plant.step([50.0, 7500.0]).cv, first, rtol=1e-9)
-        expected = jax.jit(steady_state)(50.0, 7500.0, 0.0, parameters).outputs.cv
+        expected = steady_state_of(50.0, 7500.0, 0.0, parameters).outputs.cv
         np.testing.assert_allclose(first, expected, rtol=1e-9)
 
 
