@@ -6,6 +6,7 @@ import dataclasses
 import warnings
 from pathlib import Path
 
+import jax
 import numpy as np
 import xarray as xr
 
@@ -100,9 +101,10 @@ def rerun(store: Path, number: int) -> Rerun:
             f"scenario {number} was stored by other code or inputs; it may differ now", stacklevel=2
         )
     model = identify_models([scenario.model_point])[scenario.model_point]
+    parameters = jax.tree.map(np.float64, scenario.plant)  # arrays: no program of its own for every scenario
     trajectory = simulate(
         Controller(scenario.structure, scenario.tuning, model),
-        WellPlant(parameters=scenario.plant, actuator=scenario.actuator),
+        WellPlant(parameters=parameters, actuator=scenario.actuator),
         scenario.reference,
         samples=scenario.samples,
         disturbance=scenario.disturbance,

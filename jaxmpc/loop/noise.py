@@ -12,6 +12,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxmpc.errors import InputError
 
+ROWS = 4096  # samples of one call, of any lanes: one program draws them all
+
 
 def noise_samples(
     deviation: Float[Array, " cv"],
@@ -39,12 +41,20 @@ def errors_of(deviation: np.ndarray, seeds: np.ndarray, samples: int) -> np.ndar
     """
     if not deviation.any():
         return np.zeros((len(deviation), samples, deviation.shape[1]))
-    return np.asarray(_errors(deviation, seeds, np.arange(samples)))
+    lanes, cvs = deviation.shape
+    lane, sample = (at.ravel() for at in np.indices((lanes, samples)))
+    found = np.empty((lanes * samples, cvs))
+    for begin in range(0, len(found), ROWS):
+        row = np.minimum(np.arange(begin, begin + ROWS), len(found) - 1)
+        errors = np.asarray(_errors(deviation[lane[row]], seeds[lane[row]], sample[row]))
+        found[begin : begin + ROWS] = errors[: len(found) - begin]
+    return found.reshape(lanes, samples, cvs)
 
 
 @jax.jit
 def _errors(deviation, seeds, samples):
-    return jax.vmap(lambda d, s: noise_samples(d, s[0], s[1], samples))(deviation, seeds)
+    row = lambda d, s, k: noise_samples(d, s[0], s[1], k[None])[0]  # noqa: E731
+    return jax.vmap(row)(deviation, seeds, samples)
 
 
 def check_deviation(given, cvs: int) -> np.ndarray:

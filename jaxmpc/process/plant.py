@@ -174,7 +174,14 @@ def steady_state(
     return SteadyState(x, outputs, drifting <= STEADY_TOLERANCE, drifting, hours)
 
 
-steady_state_of = jax.jit(steady_state)  # of all arguments: compiled once, whatever the plant
+_steady_state = jax.jit(steady_state)
+
+
+def steady_state_of(choke, lift, disturbance, parameters: WellParameters) -> SteadyState:
+    """`steady_state` from the shipped one, compiled once for all numbers and plants."""
+    given = choke, lift, disturbance, parameters
+    # Python's numbers and arrays would be arguments of two kinds, each with a program
+    return _steady_state(*jax.tree.map(lambda v: jnp.asarray(v, dtype=jnp.float64), given))
 
 
 def _known(choke, lift, disturbance, parameters) -> bool:

@@ -15,6 +15,7 @@ from jaxmpc import status
 from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.controller.measurement import MISSING, OUTSIDE, SensorFault, fault_errors
 from jaxmpc.errors import InputError
+from jaxmpc.loop.compiled import _Run
 from jaxmpc.loop.noise import noise_samples
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import simulate, simulate_batch, simulate_batches
@@ -154,8 +155,11 @@ def test_neither_pieces_of_lanes_nor_of_samples_nor_padding_change_results(lanes
     pieces = run(lanes_at_once=2)
     assert [list(piece.lanes) for piece in pieces] == [[0, 1], [2, 3], [4]]
     in_pieces = whole(pieces)  # the third piece was half copies
-    monkeypatch.setattr("jaxmpc.loop.compiled.LONGEST", 9)
-    in_time = whole(run())  # two samples too many
+    stride = _Run.stride
+    # of the same program: a table of another length would be another one
+    shorter = lambda self, packed, begin, most=9: stride(self, packed, begin, min(most, 9))  # noqa: E731
+    monkeypatch.setattr(_Run, "stride", shorter)
+    in_time = whole(run())
     for name in at_once:
         if name in ("nodes", "gap", "bound", "solve_time"):
             continue
@@ -183,14 +187,13 @@ def test_noise_is_named_by_its_seed(lanes, singles):
 
 
 def test_noise_has_the_deviation_that_was_asked_for(lanes):
-    several = [
-        noise_samples(jnp.asarray([40.0, 0.5]), jnp.asarray(3), jnp.asarray(k), jnp.arange(4000))
-        for k in range(2)
-    ]
+    noise = jax.jit(noise_samples)
+    deviation = np.array([40.0, 0.5])
+    several = [np.asarray(noise(deviation, 3, k, np.arange(4000))) for k in range(2)]
     np.testing.assert_allclose(np.std(several[0], axis=0), [40.0, 0.5], rtol=0.05)
     np.testing.assert_allclose(np.mean(several[0], axis=0), 0.0, atol=2.0)
     assert abs(np.corrcoef(several[0][:, 0], several[1][:, 0])[0, 1]) < 0.05
-    later = noise_samples(jnp.asarray([40.0, 0.5]), jnp.asarray(3), jnp.asarray(1), jnp.arange(10, 12))
+    later = noise(deviation, 3, 1, np.arange(10, 12))
     np.testing.assert_array_equal(later, several[1][10:12])
 
 
@@ -238,7 +241,7 @@ from jaxmpc import Reference, StepResponseModel, WellPlant
 from jaxmpc.controller.controller import Controllers
 from jaxmpc.loop.simulate import simulate_batches
 from studies.definition import presets
-assert jax.device_count() == 4
+assert jax.device_count() == 2
 structure = presets.structure()
 tunings = [presets.tuning(structure, changes={"move_weight": {"choke": w, "gas_lift": 0.2}}) for w in WEIGHTS]
 lanes = Controllers(structure, tunings, StepResponseModel.load(sys.argv[1]))
@@ -249,20 +252,20 @@ np.savez(sys.argv[2], **batch.fields)
 
 
 def test_several_devices_give_the_results_of_one(lanes, model, tmp_path):
-    script = SPREAD.replace("WEIGHTS", repr(WEIGHTS))
+    script = SPREAD.replace("WEIGHTS", repr(WEIGHTS[:3]))  # two lanes, and one that is filled up
     command = [
         sys.executable,
         "-c",
         script,
         str(model.save(tmp_path / "model.json")),
-        str(tmp_path / "four.npz"),
+        str(tmp_path / "two.npz"),
     ]
-    flags = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
+    flags = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
     subprocess.run(command, env=flags, check=True, cwd=Path(__file__).parents[2])
     one = whole(simulate_batches(lanes, WellPlant(), TO_30_PERCENT, samples=25, noise=[40.0, 0.5]))
-    four = np.load(tmp_path / "four.npz")
+    two = np.load(tmp_path / "two.npz")
     for name in ("cv", "mv", "move", "bias", "objective", "status"):
-        np.testing.assert_allclose(four[name], one[name], **LIMITS, err_msg=name)
+        np.testing.assert_allclose(two[name], one[name][:3], **LIMITS, err_msg=name)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import sys
 import warnings
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -90,7 +91,7 @@ def alone(scenario, models):
     """The scenario run by itself: trajectory and key figures."""
     found = simulate(
         Controller(scenario.structure, scenario.tuning, models[scenario.model_point]),
-        WellPlant(parameters=scenario.plant, actuator=scenario.actuator),
+        WellPlant(parameters=jax.tree.map(np.float64, scenario.plant), actuator=scenario.actuator),
         scenario.reference,
         samples=scenario.samples,
         disturbance=scenario.disturbance,

@@ -525,7 +525,9 @@ def test_a_stored_scenario_is_the_run_of_its_tuned_values(real):
         assert float(scenario.tuning.move_weight[0]) == data[WEIGHT].values[k]
         assert evaluated.scenario_hash(k) == data.scenario_hash.values[k]
     models = identify_models([evaluated.scenario(7).model_point])
-    fields, _ = run_scenarios([evaluated.scenario(7)], models, lanes=1, points=2, every=10, trajectories=())
+    # with the lanes of the search, which then has its program
+    options = dict(lanes=4, shared_model=True, points=2, every=10, trajectories=())
+    fields, _ = run_scenarios([evaluated.scenario(7)], models, **options)
     for kpi in KPIS:
         if kpi.name not in CLOCK:
             stored = data[kpi.name].values[7]
