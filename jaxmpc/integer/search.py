@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmpc.integer import listing
@@ -207,7 +208,10 @@ class _Search(NamedTuple):
         """The relaxation is known: it may be whole already; if not, its rounded moves come next."""
         low, high = self.limits
         bound = jnp.maximum(root.bound, 0.0)  # every term of (6.6) is non-negative
-        value = jnp.where(self.none, root.objective, root.snapped)
+        # the envelope of squared moves is exact up to as many steps as it has levels, and a bound beyond them
+        levels = self.qp.steep.shape[0] or np.inf
+        exact = jnp.all(~self.qp.whole | (jnp.abs(root.warm.x) < levels + 0.5))
+        value = jnp.where(self.none, root.objective, jnp.where(exact, root.snapped, jnp.inf))
         found = jnp.isfinite(root.warm.x).all() & jnp.isfinite(root.bound)
         closed = jnp.where(
             self.none,
