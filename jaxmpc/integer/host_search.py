@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxmpc.integer.actuators import Actuator
 from jaxmpc.integer.feasible import UNBOUNDED, Chain, chains_of, nearest, satisfied, whole
 from jaxmpc.integer.lower_bound import LowerModel
 from jaxmpc.integer.relaxer import LaneLimits, Relaxations
@@ -68,6 +69,7 @@ class Search:
         root: its solved relaxation, lane 0.
         gap: relative gap at which a solve is optimal.
         time_limit: seconds of work on this problem after which the best plan so far is returned; None for none.
+        actuators: what the integer MVs must keep besides limits and rows; none if that is all.
     """
 
     def __init__(
@@ -77,13 +79,19 @@ class Search:
         root: Relaxations,
         gap: float,
         time_limit: float | None,
+        actuators: Sequence[Actuator] = (),
     ):
         self.constants, self.instance, self.time_limit = constants, instance, time_limit
         self.gap = max(gap, FINEST)
         self.limits = np.asarray(instance.lower), np.asarray(instance.upper)
         self.chains: list[Chain] = chains_of(
-            constants.structure, constants.size, np.asarray(instance.row_low), np.asarray(instance.row_high)
+            constants.structure,
+            constants.size,
+            np.asarray(instance.row_low),
+            np.asarray(instance.row_high),
+            actuators,
         )
+        self.restricted = any(chain.restricted for chain in self.chains)
         self.root, self.start = root, root.start(0)
         self.root_bound = max(float(root.bound[0]), 0.0)  # every term of (6.6) is non-negative
         self.value, self.x = np.inf, None
@@ -153,6 +161,8 @@ class Search:
     def offer(self, result: Relaxations, lane: int) -> None:
         """Take a solved problem with its integer moves rounded as incumbent if that is better."""
         if result.snapped[lane] < self.value and np.isfinite(result.x[lane]).all():
+            if self.restricted and not self.allows(result.x[lane]):
+                return
             self.value, self.x = float(result.snapped[lane]), result.x[lane].copy()
             self.x[self.constants.integer] = np.round(self.x[self.constants.integer])
 
@@ -200,6 +210,11 @@ class Search:
         return LowerModel(value, center, lower, upper, excess, c.schur, c.radius, c.order, c.leading)
 
     # ---- incumbents
+    def allows(self, x: np.ndarray) -> bool:
+        """Whether moves, the integer ones rounded, keep all that whole moves must."""
+        low, high = (whole(values[self.constants.integer]) for values in self.limits)
+        return bool(satisfied(self.chains, whole(x[self.constants.integer])[None], low, high)[0])
+
     def rounded(self, moves: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray | None:
         """Whole moves near `moves` that satisfy the hard rows, or None where there are none; see `nearest`."""
         point = np.clip(whole(moves), lower, upper)

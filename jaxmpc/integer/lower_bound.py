@@ -189,6 +189,11 @@ def enumerate_below(
         good = (reached >= chain.low[b]) & (reached <= chain.high[b])
         if chain.coupled[b]:
             good &= np.abs(domain - moves[:, i - len(chains), None]) <= 1
+        if chain.allowed is not None:
+            good &= chain.passes(b, position[:, k, None], domain)
+        if chain.apart is not None:
+            near = k + len(chains) * np.flatnonzero(chain.apart[b, :b])
+            good &= (domain == 0) | (moves[:, near] == 0).all(axis=1, keepdims=True)
         below = total < cutoff
         if np.isfinite(cutoff):
             out = good & ~below

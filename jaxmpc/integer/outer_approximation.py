@@ -65,7 +65,8 @@ def outer_approximation(
         if point is None or not finished:
             return False, best_bound
         search.nodes += 1
-        if tangents.knows(point):
+        allowed = not search.restricted or satisfied(search.chains, point[None], lower, upper)[0]
+        if tangents.knows(point) or not allowed:
             master.forbid(point)  # rounding of the master: its value is known, only what is left matters
         points = around(search.chains, point, lower, upper)
 

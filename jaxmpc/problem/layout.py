@@ -29,6 +29,7 @@ from jaxmpc.problem.structure import Structure
 BLOCKS = (4, 8, 16, 32, 64, 128, 256)
 HORIZON = (32, 64, 128, 256, 384, 512)
 WINDOW = (32, 128, 512)
+VALUES = (8, 64, 512)
 
 
 def rung(count: int, ladder: tuple[int, ...]) -> int:
@@ -46,11 +47,13 @@ class Size(NamedTuple):
     # samples of the shift register, at least the prediction horizon and the coefficients of the model
     future: int
     windows: int  # rows of the predictive mean-move limit per MV; none in other modes
-    past: int  # moves that the mean-move limit remembers
+    past: int  # moves that the mean-move limit and the dwell remember
+    values: int = 0  # allowed values of an MV, none where no MV has a list
 
     @classmethod
     def of(cls, structure: Structure, samples: int) -> Size:
         """The size of a structure with a model of so many coefficients."""
+        lists = [values for values in structure.integer_values if values is not None]
         return cls(
             cvs=structure.cv_count,
             mvs=structure.mv_count,
@@ -58,7 +61,8 @@ class Size(NamedTuple):
             horizon=rung(structure.horizon_count, HORIZON),
             future=rung(max(structure.prediction_horizon, samples), HORIZON),
             windows=rung(len(window_rows(structure)), HORIZON) if len(window_rows(structure)) else 0,
-            past=rung(structure.mean_move_window, WINDOW),
+            past=rung(max(structure.mean_move_window, *structure.dwell, 1), WINDOW),
+            values=rung(max(map(len, lists)), VALUES) if lists else 0,
         )
 
     @property
@@ -100,6 +104,8 @@ class Layout(eqx.Module):
     first: Int[Array, ""]  # Hw
     last: Int[Array, ""]  # Hp
     dt: Float[Array, ""]  # sampling interval [s]
+    # allowed values, infinite for MVs without a list and beyond its end; None where the size has none [MV unit]
+    values: Float[Array, "mv value"] | None = None
 
     @property
     def real(self) -> Bool[Array, " block"]:
@@ -124,7 +130,9 @@ def layout_of(structure: Structure, size: Size) -> Layout:
     counts = moves_per_block(structure)
     later = np.eye(structure.control_horizon, k=1)
     shift = block_members(structure).T @ later @ sample_moves(structure) / counts[:, None]
-    step = structure.integer_step
+    step = structure.steps
+    lists = structure.integer_values or (None,) * structure.mv_count
+    allowed = [np.pad(v or (), (0, size.values - len(v or ())), constant_values=np.inf) for v in lists]
     fields: dict[str, Any] = dict(
         start=padded(block_starts(structure), size.blocks),
         length=padded(structure.blocks, size.blocks),
@@ -142,5 +150,6 @@ def layout_of(structure: Structure, size: Size) -> Layout:
         first=np.asarray(structure.first_penalised),
         last=np.asarray(structure.prediction_horizon),
         dt=np.asarray(structure.dt),
+        values=np.array(allowed) if size.values else None,
     )
     return Layout(**fields)
