@@ -343,7 +343,13 @@ class Core(eqx.Module):
         first, row = mv * self.size.blocks, mv * self.size.rows
         low = jnp.maximum(instance.lower[first], instance.row_low[row] / held)
         high = jnp.minimum(instance.upper[first], instance.row_high[row] / held)
-        return jnp.clip(move / scale[first], low, high) * scale[first]
+        wanted = move / scale[first]
+        kept = jnp.clip(wanted, low, high)
+        if (
+            self.tables.complete is not None
+        ):  # whole moves that were decided on the host may have other limits
+            kept = jnp.where(self.layout.integer, wanted, kept)
+        return kept * scale[first]
 
     def conclude(self, moment: Moment) -> tuple[ControllerState, StepInfo]:
         """Carry out what the compiled program decided; the MVs are held where it left something open."""
