@@ -174,6 +174,9 @@ def enumerate_below(
     for i, (k, b) in enumerate(owners):
         chain, column = chains[k], model.order[i]
         domain = np.arange(int(lower[column]), int(upper[column]) + 1)
+        if chain.allowed is not None:  # few of many moves end where they may
+            away = np.unique(chain.allowed[:, None] - np.unique(position[:, k]))
+            domain = np.intersect1d(domain, away[away % chain.counts[b] == 0] // chain.counts[b])
         if len(bounds) * len(domain) > CELLS:
             if beam is None:
                 return None
