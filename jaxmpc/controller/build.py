@@ -102,7 +102,7 @@ class Scenarios:
         tunings = [within_values(structures[k if own else 0], t) for k, t in enumerate(tunings)]
         one_each = lambda values: list(values) * number if len(values) == 1 else list(values)  # noqa: E731
         pairs = {(s, m.samples) for s in set(structures) for m in models}
-        most = max(len(s.integer_mvs) * s.block_count for s in structures)
+        most = max(sum(map(s.whole_blocks, s.integer_mvs)) for s in structures)
         return cls(
             *map(one_each, (structures, tunings, models)),
             own=_Own(*(len(values) > 1 for values in (structures, tunings, models))),

@@ -13,7 +13,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from jaxmpc import html
@@ -29,7 +29,7 @@ from jaxmpc.integer.relaxer import Relaxations
 from jaxmpc.integer.search import Decision, Relaxed, decide
 from jaxmpc.integer.solve import continuous_feasible
 from jaxmpc.model.step_response import StepResponseModel
-from jaxmpc.problem.blocking import moves_per_block, sample_moves
+from jaxmpc.problem.blocking import counts_by_mv, moves_of_samples, moves_per_block
 from jaxmpc.problem.condense import dynamic_matrix
 from jaxmpc.problem.instance import QpInstance, make_instance
 from jaxmpc.problem.layout import Size
@@ -52,7 +52,8 @@ class Plan:
         objective: (6.6) with all constants; None without a plan.
         bound: proven lower bound of the objective.
         gap: relative gap between the two.
-        moves: per-sample move of each block (`moves`) or the move at its first sample (`inputs`).
+        moves: per-sample move of each block (`moves`) or the move at its first sample (`inputs`); zero beyond the last
+            block of an MV with blocks of its own.
         mv: MVs of the Hu samples, row 0 after the move applied now.
         cv: predicted CVs at j = 1..Hp.
         eps_high, eps_low: largest violation of each CV limit over the penalised samples.
@@ -60,6 +61,8 @@ class Plan:
         solve_time_s: wall time of the solve without compilation [s].
         finished_by: which path closed the problem, None if none did.
         warm: prices of the root relaxation, a start for the next sample.
+        integer_until: under an integer horizon, the samples from the first on in which the moves of each MV are whole (0 for
+            a continuous one): later moves are relaxed, and so are objective and bound. None where no MV has relaxed ones.
     """
 
     status: str
@@ -75,6 +78,7 @@ class Plan:
     solve_time_s: float
     finished_by: str | None
     warm: WarmStart | None = None
+    integer_until: Int[np.ndarray, " mv"] | None = None
 
     def _repr_html_(self) -> str:
         """For notebooks."""
@@ -120,6 +124,7 @@ class Planner:
         cold = jax.eval_shape(core.init, np.zeros(size.cvs), np.zeros(size.mvs)).warm
         self._cold = jax.tree.map(lambda v: np.zeros((1, *v.shape)), cold)
         self._pose = PackedCall(_posed)
+        self._integer_until = np.array(structure.integer_until) if structure.relaxed_moves else None
 
     def solve(
         self,
@@ -235,7 +240,8 @@ class Planner:
     ) -> Plan:
         if result.x is None:
             name, took = codes.STATUS[result.status], clock.seconds
-            return Plan(name, None, None, None, None, None, None, None, None, result.nodes, took, None)
+            none = Plan(name, None, None, None, None, None, None, None, None, result.nodes, took, None)
+            return dataclasses.replace(none, integer_until=self._integer_until)
         core, size = self.controllers.cores.shared, self.controllers.size
         x = np.array(result.x)
         x = np.where(np.asarray(core.qp.whole), np.round(x), x)
@@ -252,7 +258,7 @@ class Planner:
             bound=bound,
             gap=float(relative_gap(objective, bound, self._unit)),
             moves=moves,
-            mv=mv_now + np.cumsum(sample_moves(self.structure) @ moves, axis=0),
+            mv=mv_now + np.cumsum(moves_of_samples(self.structure, moves), axis=0),
             cv=cv,
             eps_high=eps[0],
             eps_low=eps[1],
@@ -260,6 +266,7 @@ class Planner:
             solve_time_s=clock.seconds,
             finished_by=result.finished_by if state == codes.OPTIMAL else None,
             warm=result.root,
+            integer_until=self._integer_until,
         )
 
     def objective(
@@ -277,7 +284,7 @@ class Planner:
         beyond = np.maximum(np.abs(deviation) - tuning.deadzone, 0.0)
         eps_high = np.maximum((y - tuning.cv_high).max(axis=0), 0.0)
         eps_low = np.maximum((tuning.cv_low - y).max(axis=0), 0.0)
-        counts = moves_per_block(self.structure)[:, None]
+        counts = counts_by_mv(self.structure)
         value = (
             (tuning.cv_weight * deviation**2).sum()
             + (tuning.move_weight * counts * moves**2).sum()
@@ -297,14 +304,14 @@ def _repair(structure: Structure, size: Size, instance: QpInstance, x: np.ndarra
     by_mv = lambda values: np.reshape(values, (size.mvs, -1))  # noqa: E731
     lower, upper = by_mv(instance.lower), by_mv(instance.upper)
     row_low, row_high = by_mv(instance.row_low), by_mv(instance.row_high)
-    x, counts = x.copy(), moves_per_block(structure)
-    for mv in sorted(set(range(size.mvs)) - set(structure.integer_mvs)):
-        position, own = 0.0, by_mv(x)[mv]
-        for b in range(structure.block_count):
-            low = max(lower[mv, b], (row_low[mv, b] - position) / counts[b])
-            high = min(upper[mv, b], (row_high[mv, b] - position) / counts[b])
-            own[b] = min(max(own[b], low), high) if low <= high else own[b]
-            position += counts[b] * own[b]
+    x = x.copy()
+    for mv in range(size.mvs):
+        position, own, whole = 0.0, by_mv(x)[mv], structure.whole_blocks(mv)
+        for b, count in enumerate(moves_per_block(structure, mv)):
+            low = max(lower[mv, b], (row_low[mv, b] - position) / count)
+            high = min(upper[mv, b], (row_high[mv, b] - position) / count)
+            own[b] = min(max(own[b], low), high) if b >= whole and low <= high else own[b]
+            position += count * own[b]
     return x
 
 

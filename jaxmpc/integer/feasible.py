@@ -3,7 +3,8 @@
 The rows of different MVs are independent, and those of one MV form a chain: the position after a block is the
 position before it plus the block's move, and the oscillation rows couple neighbours only. Limits therefore
 propagate along the chain, and a dynamic programme over (position, last move) decides feasibility exactly. Positions
-that a list of allowed values leaves out and a minimum dwell (`actuators`) are part of a chain.
+that a list of allowed values leaves out and a minimum dwell (`actuators`) are part of a chain. Moves beyond the
+integer horizon are continuous: what they can reach the limits of their own positions from is the last limit of the chain.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from jaxtyping import Bool, Int
 
 from jaxmpc.integer.actuators import Actuator
 from jaxmpc.problem.blocking import block_starts, coupled_blocks, moves_per_block, window_rows
+from jaxmpc.problem.instance import QpInstance
 from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure
 
@@ -27,6 +29,7 @@ MOST = 20_000_000  # combinations of position and move that are looked at in one
 HELD = 2_000_000  # of them that are remembered
 HOPS = 100_000  # pairs of allowed positions that propagation looks at
 UNBOUNDED = 10**12  # whole steps that stand for "no limit" in integer arithmetic
+SLACK = 1e-7  # by which limits of continuous moves may miss each other [scaled moves]
 
 
 class UndecidedError(Exception):
@@ -35,14 +38,15 @@ class UndecidedError(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class Chain:
-    """The blocks of one integer MV.
+    """The blocks of one integer MV whose moves are whole.
 
     Attributes:
         columns: positions of its moves in the integer vector.
         counts: moves per block.
         low, high: allowed position after each block, in steps from now.
         coupled: whether the move of block b and of b - 1 may differ by one step at most (first entry unused).
-        windows, window_low, window_high: rows of the predictive mean-move limit; checked, not propagated.
+        windows, window_low, window_high: rows of the predictive mean-move limit; checked, not propagated. Where continuous
+            moves are part of them, too, they are what these leave at most.
         allowed: positions that are allowed at every sample, increasing; None for all between the limits.
         apart: pairs of blocks of which one at most may move, because of the dwell; None without one.
     """
@@ -105,43 +109,72 @@ class Chain:
 
 
 def chains_of(
-    structure: Structure,
-    size: Size,
-    row_low: np.ndarray,
-    row_high: np.ndarray,
-    actuators: Sequence[Actuator] = (),
+    structure: Structure, size: Size, instance: QpInstance, actuators: Sequence[Actuator] = ()
 ) -> list[Chain]:
-    """Chains of all integer MVs from the limits of the hard rows (`condense.Rows`) and what else they must keep.
+    """Chains of all integer MVs from the limits of a problem, NumPy's arrays, and what else they must keep.
 
     The limits of the positions are rounded into the allowed ones.
     """
-    blocks, windows = structure.block_count, window_rows(structure)
-    low, high = (np.reshape(values, (size.mvs, size.rows)) for values in (row_low, row_high))
-    pair, window = (
-        slice(size.blocks, size.blocks + blocks),
-        slice(2 * size.blocks, 2 * size.blocks + len(windows)),
+    chains, first = [], 0
+    for k, mv in enumerate(structure.integer_mvs):
+        chain = _chain(structure, size, instance, mv, first)
+        chains.append(_restricted(chain, actuators[k], structure, mv) if actuators else chain)
+        first += len(chain.columns)
+    return chains
+
+
+def _chain(structure: Structure, size: Size, instance: QpInstance, mv: int, first: int) -> Chain:
+    """Of one integer MV, whose moves stand in the integer vector from place `first` on."""
+    blocks, windows = structure.whole_blocks(mv), window_rows(structure, mv)
+    low, high = (
+        np.reshape(v, (size.mvs, size.rows))[mv]
+        for v in map(np.asarray, (instance.row_low, instance.row_high))
     )
-    chains = [
-        Chain(
-            columns=k * blocks + np.arange(blocks),
-            counts=moves_per_block(structure),
-            low=whole(low[mv, :blocks]),
-            high=whole(high[mv, :blocks]),
-            coupled=coupled_blocks(structure) & np.isfinite(high[mv, pair]),
-            windows=windows,
-            window_low=low[mv, window],
-            window_high=high[mv, window],
+    window = slice(2 * size.blocks, 2 * size.blocks + len(windows))
+    least, most, window_low, window_high = low[:blocks], high[:blocks], low[window], high[window]
+    counts = moves_per_block(structure, mv)
+    if blocks < len(counts):
+        lower, upper = (
+            np.reshape(v, (size.mvs, -1))[mv, : len(counts)]
+            for v in map(np.asarray, (instance.lower, instance.upper))
         )
-        for k, mv in enumerate(structure.integer_mvs)
-    ]
-    if not actuators:
-        return chains
-    return [_restricted(chain, own, structure) for chain, own in zip(chains, actuators, strict=True)]
+        tail = slice(blocks, len(counts))
+        ends = _before_tail(low[: len(counts)], high[: len(counts)], lower * counts, upper * counts, blocks)
+        least, most = np.append(least[:-1], ends[0]), np.append(most[:-1], ends[1])
+        with np.errstate(invalid="ignore"):  # no limit times no share
+            reach = [np.nansum(windows[:, tail] * own[tail], axis=1) for own in (lower, upper)]
+        windows, window_low, window_high = windows[:, :blocks], window_low - reach[1], window_high - reach[0]
+    return Chain(
+        columns=first + np.arange(blocks),
+        counts=counts[:blocks],
+        low=whole(least),
+        high=whole(most),
+        coupled=coupled_blocks(structure, mv)[:blocks]
+        & np.isfinite(high[size.blocks : size.blocks + blocks]),
+        windows=windows,
+        window_low=window_low,
+        window_high=window_high,
+    )
 
 
-def _restricted(chain: Chain, actuator: Actuator, structure: Structure) -> Chain:
+def _before_tail(low, high, lower, upper, blocks: int) -> tuple[float, float]:
+    """Least and largest whole position after so many blocks from which the continuous moves after them fit their limits.
+
+    Args:
+        low, high: limits of the positions after all blocks.
+        lower, upper: of what the blocks add to them.
+    """
+    least, most = low[-1], high[-1]
+    for b in range(len(low) - 1, blocks - 1, -1):
+        if lower[b] > upper[b] + SLACK or least > most + SLACK:
+            return np.inf, -np.inf
+        least, most = max(low[b - 1], least - upper[b]), min(high[b - 1], most - lower[b])
+    return np.ceil(least - SLACK), np.floor(most + SLACK)
+
+
+def _restricted(chain: Chain, actuator: Actuator, structure: Structure, mv: int) -> Chain:
     """The chain of one MV with what it must keep."""
-    start, apart = block_starts(structure), None
+    start, apart = block_starts(structure, mv)[: len(chain.columns)], None
     if actuator.dwell > 1:
         apart = np.abs(start[:, None] - start) < actuator.dwell
         np.fill_diagonal(apart, False)
@@ -149,12 +182,13 @@ def _restricted(chain: Chain, actuator: Actuator, structure: Structure) -> Chain
     return dataclasses.replace(chain, low=chain.up(chain.low), high=chain.down(chain.high))
 
 
-def resting(structure: Structure, actuator: Actuator) -> Bool[np.ndarray, " block"]:
-    """Blocks that must not move: too soon after the last move, or with a move that would repeat within the dwell."""
+def resting(structure: Structure, actuator: Actuator, mv: int) -> Bool[np.ndarray, " block"]:
+    """Blocks of whole moves that must not move: too soon after the last one, or with one that would repeat in the dwell."""
+    count = structure.whole_blocks(mv)
     if actuator.dwell <= 1:
-        return np.zeros(structure.block_count, dtype=bool)
-    early = block_starts(structure) < actuator.dwell - actuator.since
-    return early | (moves_per_block(structure) > 1)
+        return np.zeros(count, dtype=bool)
+    early = block_starts(structure, mv)[:count] < actuator.dwell - actuator.since
+    return early | (moves_per_block(structure, mv)[:count] > 1)
 
 
 def whole(steps: np.ndarray) -> Int[np.ndarray, "..."]:

@@ -133,10 +133,10 @@ def _restricted(
     for i, own in enumerate(actuators):
         c = relaxer.scenario(i)
         low, high = lower[i, c.integer], upper[i, c.integer]
-        for chain, actuator in zip(
-            chains_of(c.structure, c.size, row_low[i], row_high[i], own), own, strict=True
-        ):
-            rest, columns = resting(c.structure, actuator), chain.columns
+        one = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], instances)
+        chains = chains_of(c.structure, c.size, one, own)
+        for chain, actuator, mv in zip(chains, own, c.structure.integer_mvs, strict=True):
+            rest, columns = resting(c.structure, actuator, mv), chain.columns
             outside = recover and chain.restricted and ((chain.low > 0) | (chain.high < 0)).any()
             if outside:  # as fast as move limits allow may not end in an allowed position, or be too soon
                 low[columns], high[columns] = np.minimum(low[columns], 0.0), np.maximum(high[columns], 0.0)
@@ -192,8 +192,7 @@ def _whole_near(
     constants: Constants, instance: QpInstance, wanted: np.ndarray, actuators: Sequence[Actuator]
 ) -> np.ndarray:
     """Whole moves near `wanted` that satisfy the hard rows; the rounded ones where there are none within reach."""
-    rows = np.asarray(instance.row_low), np.asarray(instance.row_high)
-    chains = chains_of(constants.structure, constants.size, rows[0], rows[1], actuators)
+    chains = chains_of(constants.structure, constants.size, instance, actuators)
     lower, upper = (whole(np.asarray(v)[constants.integer]) for v in (instance.lower, instance.upper))
     middle = whole(np.floor(wanted + 0.5))
     for reach in (0, 3, 30):

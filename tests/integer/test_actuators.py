@@ -2,6 +2,8 @@
 
 import dataclasses
 import itertools
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ from jaxmpc.integer.feasible import (
     tighten,
     within,
 )
-from jaxmpc.integer.lower_bound import LowerModel, assignment_order, enumerate_below
+from jaxmpc.integer.lower_bound import LowerModel, enumerate_below
 from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure
 from tests.oracles.actuators import kept
@@ -58,7 +60,8 @@ def random_chain(rng, blocks, blocking):
     )  # which the limits of the tuning are held to
     low[: len(blocks)] = np.maximum(np.floor(-rng.integers(0, 14, len(blocks)) / step), ends[0] / step)
     high[: len(blocks)] = np.minimum(np.ceil(rng.integers(0, 14, len(blocks)) / step), ends[1] / step)
-    (chain,) = chains_of(structure, size, low, high, actuators)
+    instance: Any = SimpleNamespace(row_low=low, row_high=high)
+    (chain,) = chains_of(structure, size, instance, actuators)
     body = {
         "model": {"mv": ["u"]},
         "structure": {
@@ -84,7 +87,7 @@ def cases(count=60):
             at = np.cumsum(MOVES * chain.counts, axis=1)
             good = ((at >= low) & (at <= high)).all(axis=1)
             good[good] = [kept(body, 0, point) for point in MOVES[good].tolist()]
-            still = resting(structure, actuator)
+            still = resting(structure, actuator, 0)
             yield rng, chain, np.where(still, 0, -3), np.where(still, 0, 3), MOVES[good]
 
 
@@ -139,7 +142,7 @@ def test_lists_hold_every_feasible_plan_below_the_cutoff_and_no_other():
             excess=np.where(np.arange(7) <= (upper - lower)[:, None], rng.random((4, 7)), np.inf),
             schur=root.T @ root,
             radius=np.full(4, np.inf),
-            order=assignment_order(4, 1),
+            order=np.arange(4),
             leading=root,
         )
         bounds = 1.0 + 0.5 * (((good - model.center) @ root.T) ** 2).sum(axis=1)
@@ -172,7 +175,8 @@ def test_an_mv_outside_its_limits_gets_room_for_its_shortest_way_back_and_no_mor
     low, high = np.full(size.rows, -np.inf), np.full(size.rows, np.inf)
     low[:4], high[:4] = -20, -10  # from 100 to 50 or less
     actuators = actuators_of(structure, np.array([100.0]), np.array([LONG_AGO]))
-    (chain,) = chains_of(structure, size, low, high, actuators)
+    instance: Any = SimpleNamespace(row_low=low, row_high=high)
+    (chain,) = chains_of(structure, size, instance, actuators)
     lower, upper = np.full(4, -9), np.zeros(4, dtype=int)  # 45 at once, and 50 is not allowed
     assert nearest([chain], np.zeros(4), lower, upper) is None
     widened = fastest_return(chain, lower, upper)
