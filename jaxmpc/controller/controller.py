@@ -24,6 +24,7 @@ from jaxmpc.controller.build import Scenarios
 from jaxmpc.controller.core import ControllerState, Core, Moment, StepInfo
 from jaxmpc.controller.sample import Sample, checked, checked_start
 from jaxmpc.errors import InputError
+from jaxmpc.integer.actuators import Actuator, actuators_of, samples_since
 from jaxmpc.integer.finish import finish_steps
 from jaxmpc.integer.host_search import SearchResult
 from jaxmpc.integer.relaxer import Relaxations, Relaxer
@@ -202,6 +203,7 @@ class Batch:
     def _finish_some(self, moment: Moment, index: np.ndarray, spent: float) -> list[SearchResult]:
         """Of scenarios of one structure."""
         own: Moment = jax.tree.map(lambda leaf: np.asarray(leaf)[index], moment)
+        structure = self.scenarios.structures[index[0]]
         relaxers = self.relaxers.without(np.asarray(moment.state.sensors.off))
         try:
             with compiling_for(str(self.size)):
@@ -213,6 +215,8 @@ class Batch:
                     gap=self.gap,
                     time_limit=self.time_limit,
                     finish=self.finish,
+                    actuators=_actuators(structure, own) if structure.has_gaps_or_dwell else (),
+                    recover=True,
                     spent=float(spent),
                 )
         except InputError:  # moves without limits have ranges that follow from the measurements
@@ -259,6 +263,19 @@ class Controllers(Batch):
         constants = scenarios.constants(qps) if scenarios.integers else []
         relaxers = Relaxers(scenarios, {1: Relaxer(qps, constants)} if scenarios.integers else {})
         super().__init__(scenarios, scenarios.core(qps, constants), relaxers, *options)
+
+
+def _actuators(structure: Structure, moment: Moment) -> list[list[Actuator]]:
+    """What the integer MVs of every lane must keep besides limits and hard rows."""
+    state, found = moment.state, []
+    for k, past in enumerate(np.asarray(state.past_moves)):
+        now, since = np.array(state.mv[k]), samples_since(structure, past)
+        if moment.correction is not None:
+            back = np.asarray(moment.correction[k])
+            now += back
+            since = np.where(samples_since(structure, back[None]) == 1, 0, since)  # it is a move, too
+        found.append(actuators_of(structure, now, since, np.asarray(state.manual[k])))
+    return found
 
 
 def check_finish(finish: str) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -17,10 +18,11 @@ from numpy.typing import ArrayLike
 
 from jaxmpc import html
 from jaxmpc import status as codes
-from jaxmpc.controller.case import check_position, step_array
+from jaxmpc.controller.case import check_listed, check_position, checked_since, step_array
 from jaxmpc.controller.controller import Controllers, check_finish, in_one_call, one_lane
 from jaxmpc.controller.core import Core
 from jaxmpc.controller.sample import require_double_precision
+from jaxmpc.integer.actuators import LONG_AGO, Actuator, actuators_of, samples_since
 from jaxmpc.integer.finish import finish_steps
 from jaxmpc.integer.host_search import SearchResult
 from jaxmpc.integer.relaxer import Relaxations
@@ -133,6 +135,7 @@ class Planner:
         setpoint: Float[ArrayLike, "horizon cv"],
         previous_moves: Float[ArrayLike, "block mv"] | None = None,
         past_moves: Float[ArrayLike, "window mv"] | None = None,
+        samples_since_move: Sequence[int | None] | None = None,
         recover: bool = False,
         warm: WarmStart | None = None,
         time_limit: float | None = None,
@@ -142,7 +145,7 @@ class Planner:
         """Solve one step; arguments as in `solve_plan`.
 
         Args:
-            past_moves: moves of the mean-move window, ``"window mv"`` oldest first, or None.
+            past_moves: moves of the mean-move window, ``"window mv"`` oldest first, or None; the dwell sees them, too.
             recover: let MVs outside their limits return the shortest way.
             warm: `Plan.warm` of a neighbouring step; ignored where its size does not fit.
         """
@@ -151,6 +154,7 @@ class Planner:
         gap, time_limit = check_gap("gap", gap), check_time_limit("time_limit", time_limit)
         as_array = lambda v: np.asarray(v, dtype=np.float64)  # noqa: E731
         free_response, setpoint, mv_now = as_array(free_response), as_array(setpoint), as_array(mv_now)
+        check_listed(self.structure, mv_now)
         past: np.ndarray = self._no_past.copy()
         if past_moves is not None:
             moves = as_array(past_moves)[-past.shape[1] :]
@@ -165,7 +169,15 @@ class Planner:
         clock, own = Clock(), self.controllers
         with compiling_for(str(own.size)):
             instance, found = self._pose(own.cores, own.flat, *known, past, start, settings)
-        result = self._decided(instance, found, previous_moves, gap, time_limit, finish, clock.seconds)
+        actuators = []
+        if self.structure.has_gaps_or_dwell:
+            moves = np.concatenate([past[0, :-1], np.where(known[3] == 0.0, past[0, -1:], known[3])])
+            since = np.minimum(
+                samples_since(self.structure, moves), _told(self.structure, samples_since_move)
+            )
+            actuators = [actuators_of(self.structure, mv_now, since)]
+        line = gap, time_limit, finish, clock.seconds
+        result = self._decided(instance, found, previous_moves, actuators, recover, *line)
         return self._plan(one_lane(instance), result, mv_now, free_response, setpoint, gap, clock)
 
     def _decided(
@@ -173,6 +185,8 @@ class Planner:
         instance: QpInstance,
         decision: Decision,
         previous_moves,
+        actuators: list[list[Actuator]],
+        recover: bool,
         gap,
         time_limit,
         finish: str,
@@ -198,6 +212,8 @@ class Planner:
             gap=gap,
             time_limit=time_limit,
             finish=finish,
+            actuators=actuators,
+            recover=recover,
             spent=spent,
         )
         return result
@@ -278,6 +294,11 @@ class Planner:
         return float(value), cv, (eps_high, eps_low)
 
 
+def _told(structure: Structure, since: Sequence[int | None] | None) -> np.ndarray:
+    """Samples since the last moves, `LONG_AGO` where nothing is told."""
+    return np.array([LONG_AGO if n is None else n for n in since or (None,) * structure.mv_count])
+
+
 def _repair(structure: Structure, size: Size, instance: QpInstance, x: np.ndarray) -> np.ndarray:
     """Take solver tolerance out of the continuous moves: clip moves, then positions, block after block."""
     by_mv = lambda values: np.reshape(values, (size.mvs, -1))  # noqa: E731
@@ -307,6 +328,7 @@ def solve_plan(
     free_response: Float[ArrayLike, "horizon cv"],
     setpoint: Float[ArrayLike, "horizon cv"],
     previous_moves: Float[ArrayLike, "block mv"] | None = None,
+    samples_since_move: Sequence[int | None] | None = None,
     time_limit: float | None = None,
     gap: float = 1e-6,
     finish: str = "auto",
@@ -314,11 +336,13 @@ def solve_plan(
     """Solve one controller step.
 
     Args:
-        mv_now: MVs before the move, ``"mv"`` [MV unit], within their limits.
+        mv_now: MVs before the move, ``"mv"`` [MV unit], within their limits and on a value of their lists.
         last_move: previous move, ``"mv"`` [MV unit]; oscillation rows use it rounded to whole steps.
         free_response: Lambda at j = 1..Hp with bias, ``"horizon cv"`` [CV unit].
         setpoint: r at j = 1..Hp, ``"horizon cv"`` [CV unit].
         previous_moves: moves to start from, ``"block mv"``; may be infeasible, never changes the answer.
+        samples_since_move: samples since the last move of every MV, for the dwell; 1 for a move at the sample before, None
+            for long ago, which a `last_move` of half a step or more contradicts: the MV has then just moved.
         time_limit: seconds after which the best plan so far is returned with its true gap; None for none.
         gap: relative gap at which the plan counts as optimal.
         finish: ``auto``, ``enumeration``, ``highs`` or ``branch-and-bound``.
@@ -332,4 +356,5 @@ def solve_plan(
         for path, value in (given | {"previous_moves": previous_moves}).items()
     }
     check_position(structure, tuning, known["mv_now"])
+    known["samples_since_move"] = checked_since(structure, samples_since_move)
     return Planner(structure, tuning, model).solve(**known, time_limit=time_limit, gap=gap, finish=finish)

@@ -243,7 +243,7 @@ class _Table:
         self.reference, self.schedule, self.spacing, self.kept = controllers, schedule, spacing, kept
         self.size, self.init, self.structure = controllers.size, controllers.init, controllers.structure
         self.scenarios, self.count = controllers.scenarios, 1
-        self.grid = np.array([step or spacing for step in self.structure.integer_step])
+        self.grid = np.array([step or spacing for step in self.structure.steps])
         self.built = 0  # controllers made so far
         self._table: collections.OrderedDict[tuple[float, ...], Controllers] = collections.OrderedDict()
 

@@ -6,7 +6,7 @@ Between `integer.solve`, which knows scaled problems only, and its callers, whic
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +15,17 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmpc.errors import InputError
-from jaxmpc.integer.feasible import UndecidedError, chains_of, nearest, whole
+from jaxmpc.integer.actuators import Actuator
+from jaxmpc.integer.feasible import (
+    UNBOUNDED,
+    UndecidedError,
+    chains_of,
+    fastest_return,
+    nearest,
+    resting,
+    satisfied,
+    whole,
+)
 from jaxmpc.integer.host_search import SearchResult
 from jaxmpc.integer.relaxer import Relaxations, Relaxer
 from jaxmpc.integer.solve import solve_integers
@@ -38,6 +48,8 @@ def finish_steps(
     gap: float,
     time_limit: float | None,
     finish: str,
+    actuators: Sequence[Sequence[Actuator]] = (),
+    recover: bool = False,
     spent: float = 0.0,
 ) -> list[SearchResult]:
     """Solve one step of every scenario; all have the same integer moves.
@@ -50,6 +62,8 @@ def finish_steps(
         gap: relative gap.
         time_limit: seconds of work per scenario, None for none.
         finish: one of `integer.solve.FINISHES`.
+        actuators: what the integer MVs must keep besides limits and rows, per scenario; none if that is all.
+        recover: let MVs outside their limits return the shortest way that these leave.
         spent: seconds that every scenario has taken already.
 
     Returns:
@@ -59,7 +73,10 @@ def finish_steps(
         InputError: for ranges of whole moves that cannot be searched.
     """
     clock, relaxer = Clock(), relaxer_of(1)
-    lower, upper = _bounded(relaxer_of, instances)
+    if actuators:
+        instances = _restricted(relaxer, instances, actuators, recover)
+        root = relaxer.solve_roots(instances, root.warm)
+    lower, upper = _bounded(relaxer_of, instances, actuators)
     constants = relaxer.scenario(0)
     integer = constants.integer
     check_ranges(constants.structure, lower[:, integer], upper[:, integer])
@@ -73,13 +90,14 @@ def finish_steps(
         own = relaxer.scenario(i)
         wanted = moves.T.reshape(-1)[own.integer] / own.scales[own.integer]
         starts.append([np.clip(np.nan_to_num(wanted), -1e6, 1e6)])
-    rest: dict[str, Any] = dict(gap=gap, time_limit=time_limit, finish=finish)
+    rest: dict[str, Any] = dict(gap=gap, time_limit=time_limit, finish=finish, actuators=actuators)
     spent += clock.seconds / len(starts)
     found = solve_integers(relaxer, instances, root, starts=starts, last=False, spent=spent, **rest)
     for i, result in enumerate(found):
         late = time_limit is not None and result.seconds >= time_limit
         if result.status == LIMIT and not late and relaxer.scenario(i).chord_weight.any():
-            found[i] = _tightened(relaxer, instances, i, result, starts[i], rest)
+            own = rest | {"actuators": actuators[i : i + 1]}
+            found[i] = _tightened(relaxer, instances, i, result, starts[i], own)
     return found
 
 
@@ -105,7 +123,40 @@ def _tightened(
     return result
 
 
-def _bounded(relaxer_of, instances: QpInstance) -> tuple[np.ndarray, np.ndarray]:
+def _restricted(
+    relaxer: Relaxer, instances: QpInstance, actuators: Sequence[Sequence[Actuator]], recover: bool
+) -> QpInstance:
+    """The problems with the limits that the actuators leave: positions within the allowed ones, blocks at rest."""
+    lower, upper, row_low, row_high = (
+        np.array(v) for v in (instances.lower, instances.upper, instances.row_low, instances.row_high)
+    )
+    for i, own in enumerate(actuators):
+        c = relaxer.scenario(i)
+        low, high = lower[i, c.integer], upper[i, c.integer]
+        one = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], instances)
+        chains = chains_of(c.structure, c.size, one, own)
+        for chain, actuator, mv in zip(chains, own, c.structure.integer_mvs, strict=True):
+            rest, columns = resting(c.structure, actuator, mv), chain.columns
+            outside = recover and chain.restricted and ((chain.low > 0) | (chain.high < 0)).any()
+            if outside:  # as fast as move limits allow may not end in an allowed position, or be too soon
+                low[columns], high[columns] = np.minimum(low[columns], 0.0), np.maximum(high[columns], 0.0)
+            low[columns] = np.where(rest, np.maximum(low[columns], 0.0), low[columns])
+            high[columns] = np.where(rest, np.minimum(high[columns], 0.0), high[columns])
+            reached = chain.low, chain.high
+            if outside:
+                with contextlib.suppress(UndecidedError):
+                    reached = fastest_return(chain, whole(low[columns]), whole(high[columns])) or reached
+            rows = c.position[columns]
+            row_low[i, rows] = np.where(reached[0] > -UNBOUNDED, reached[0], -np.inf)
+            row_high[i, rows] = np.where(reached[1] < UNBOUNDED, reached[1], np.inf)
+        lower[i, c.integer], upper[i, c.integer] = low, high
+    values = lower, upper, row_low, row_high
+    return eqx.tree_at(lambda i: (i.lower, i.upper, i.row_low, i.row_high), instances, values)
+
+
+def _bounded(
+    relaxer_of, instances: QpInstance, actuators: Sequence[Sequence[Actuator]]
+) -> tuple[np.ndarray, np.ndarray]:
     """Limits ``"scenario n"``, finite for integer moves that have none: the level set of a rounded plan."""
     lower, upper = np.array(instances.lower), np.array(instances.upper)
     integer = relaxer_of(1).scenario(0).integer
@@ -119,7 +170,8 @@ def _bounded(relaxer_of, instances: QpInstance) -> tuple[np.ndarray, np.ndarray]
     for i in range(len(lower)):
         own = jax.tree.map(lambda leaf, i=i: leaf[i], instances)
         wanted = np.clip(center[i], lower[i, integer], upper[i, integer])
-        fixed_low[i, integer] = fixed_high[i, integer] = _whole_near(relaxer.scenario(i), own, wanted)
+        near = _whole_near(relaxer.scenario(i), own, wanted, actuators[i] if actuators else ())
+        fixed_low[i, integer] = fixed_high[i, integer] = near
     fixed = eqx.tree_at(lambda i: (i.lower, i.upper), instances, (fixed_low, fixed_high))
     value = relaxer.solve_roots(fixed, start).snapped
     radius = np.stack([relaxer.scenario(i).radius for i in range(len(lower))])
@@ -136,13 +188,21 @@ def _bounded(relaxer_of, instances: QpInstance) -> tuple[np.ndarray, np.ndarray]
     return lower, upper
 
 
-def _whole_near(constants: Constants, instance: QpInstance, wanted: np.ndarray) -> np.ndarray:
+def _whole_near(
+    constants: Constants, instance: QpInstance, wanted: np.ndarray, actuators: Sequence[Actuator]
+) -> np.ndarray:
     """Whole moves near `wanted` that satisfy the hard rows; the rounded ones where there are none within reach."""
-    chains = chains_of(constants.structure, constants.size, instance)
+    chains = chains_of(constants.structure, constants.size, instance, actuators)
+    lower, upper = (whole(np.asarray(v)[constants.integer]) for v in (instance.lower, instance.upper))
+    middle = whole(np.floor(wanted + 0.5))
     for reach in (0, 3, 30):
-        low, high = whole(np.floor(wanted + 0.5)) - reach, whole(np.floor(wanted + 0.5)) + reach
         with contextlib.suppress(UndecidedError):
-            found = nearest(chains, wanted, low, high)
+            found = nearest(
+                chains, wanted, np.maximum(lower, middle - reach), np.minimum(upper, middle + reach)
+            )
             if found is not None:
                 return found
-    return np.round(wanted)
+    if not actuators:
+        return np.round(wanted)
+    still = np.zeros((1, len(wanted)), dtype=int)
+    return still[0] if satisfied(chains, still, lower, upper)[0] else np.full(len(wanted), np.nan)

@@ -2,7 +2,8 @@
 
 The problem over whole moves is V(d) = sum_i own_i(d_i) + R(d) with R convex. One binary per admissible value of a free
 move makes any separable term exactly linear (for -1/0/1 these are the usual p and q with move = p - q), and cuts
-of R from solved problems bound the rest from below (outer approximation, Duran and Grossmann 1986).
+of R from solved problems bound the rest from below (outer approximation, Duran and Grossmann 1986). Positions of a list
+with gaps have one binary per allowed value, and of the moves within a dwell one at most is none of the binaries of zero.
 """
 
 from __future__ import annotations
@@ -83,6 +84,11 @@ class ReducedMilp:
             if width > 1:
                 self._row(-np.inf, 1.0, np.arange(column - width, column), np.ones(width))
         self._hard_rows(chains)
+        for chain in chains:
+            if chain.allowed is not None:
+                self._allowed_rows(chain)
+            if chain.apart is not None:
+                self._dwell_rows(chain)
         self.cutoff_row = highs.getNumRow()
         costs = np.asarray(highs.getLp().col_cost_)
         index = np.flatnonzero(costs)
@@ -127,6 +133,51 @@ class ReducedMilp:
                 least = constant + np.minimum(wide * (self.upper - self.lower), 0.0).sum()
                 if len(index) and (most > high + 1e-9 or least < low - 1e-9):
                     self._row(low - constant, high - constant, index, value)
+
+    def _allowed_rows(self, chain: Chain) -> None:
+        """Every sample's position is one of the allowed ones."""
+        assert chain.allowed is not None
+        for b, count in enumerate(chain.counts):
+            for sample in range(1, int(count) + 1):
+                wide = np.zeros(len(self.lower))
+                wide[chain.columns[:b]], wide[chain.columns[b]] = chain.counts[:b], sample
+                index, value, constant = self._in_binaries(wide)
+                reach = wide * (self.upper - self.lower)
+                least, most = constant + np.minimum(reach, 0.0).sum(), constant + np.maximum(reach, 0.0).sum()
+                among = chain.allowed[(chain.allowed >= least) & (chain.allowed <= most)].astype(float)
+                if len(among) == most - least + 1:
+                    continue  # nothing is left out
+                first = self.highs.getNumCol()
+                for _ in among:
+                    self.highs.addVar(0.0, 1.0)
+                    self.highs.changeColIntegrality(self.highs.getNumCol() - 1, highspy.HighsVarType.kInteger)
+                place = first + np.arange(len(among))
+                self._row(1.0, 1.0, place, np.ones(len(among)))
+                self._row(
+                    -constant, -constant, np.concatenate([index, place]), np.concatenate([value, -among])
+                )
+
+    def _dwell_rows(self, chain: Chain) -> None:
+        """Of blocks within the dwell one at most moves."""
+        assert chain.apart is not None
+        blocks = len(chain.columns)
+        moving = [self._moving(int(column)) for column in chain.columns]
+        for b in range(blocks):
+            near = [b, *(b + 1 + np.flatnonzero(chain.apart[b, b + 1 :]))]
+            index = np.concatenate([moving[c][0] for c in near])
+            value = np.concatenate([moving[c][1] for c in near])
+            self._row(-np.inf, 1.0 - sum(moving[c][2] for c in near), index, value)
+
+    def _moving(self, i: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """Whether a move is none of zero, as columns, values and constant of a linear form."""
+        if i not in self.first_column:
+            return np.zeros(0, dtype=int), np.zeros(0), float(self.lower[i] != 0)
+        columns = self.first_column[i] + np.arange(int(self.upper[i] - self.lower[i]))
+        if self.lower[i] == 0:
+            return columns, np.ones(len(columns)), 0.0
+        if self.lower[i] < 0 <= self.upper[i]:
+            return columns[-self.lower[i] - 1 : -self.lower[i]], -np.ones(1), 1.0
+        return columns[:0], np.zeros(0), 1.0
 
     def add_cut(self, value: float, at: np.ndarray, gradient: np.ndarray) -> None:
         """Theta >= value + gradient'(d - at)."""

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxmpc.integer.actuators import Actuator
 from jaxmpc.integer.feasible import UNBOUNDED, Chain, chains_of, nearest, satisfied, whole
 from jaxmpc.integer.followed import followed
 from jaxmpc.integer.lower_bound import LowerModel
@@ -69,6 +70,7 @@ class Search:
         root: its solved relaxation, lane 0.
         gap: relative gap at which a solve is optimal.
         time_limit: seconds of work on this problem after which the best plan so far is returned; None for none.
+        actuators: what the integer MVs must keep besides limits and rows; none if that is all.
     """
 
     def __init__(
@@ -78,11 +80,13 @@ class Search:
         root: Relaxations,
         gap: float,
         time_limit: float | None,
+        actuators: Sequence[Actuator] = (),
     ):
         self.constants, self.instance, self.time_limit = constants, instance, time_limit
         self.gap = max(gap, FINEST)
         self.limits = np.asarray(instance.lower), np.asarray(instance.upper)
-        self.chains: list[Chain] = chains_of(constants.structure, constants.size, instance)
+        self.chains: list[Chain] = chains_of(constants.structure, constants.size, instance, actuators)
+        self.restricted = any(chain.restricted for chain in self.chains)
         # whether it takes more than the chains to tell which whole moves can be followed
         self.followed = constants.structure.relaxed_moves and constants.size.windows > 0
         self.root, self.start = root, root.start(0)
@@ -154,6 +158,8 @@ class Search:
     def offer(self, result: Relaxations, lane: int) -> None:
         """Take a solved problem with its integer moves rounded as incumbent if that is better."""
         if result.snapped[lane] < self.value and np.isfinite(result.x[lane]).all():
+            if self.restricted and not self.allows(result.x[lane]):
+                return
             self.value, self.x = float(result.snapped[lane]), result.x[lane].copy()
             self.x[self.constants.integer] = np.round(self.x[self.constants.integer])
 
@@ -212,6 +218,11 @@ class Search:
         return LowerModel(value, center, lower, upper, excess, c.schur, c.radius, c.order, c.leading)
 
     # ---- incumbents
+    def allows(self, x: np.ndarray) -> bool:
+        """Whether moves, the integer ones rounded, keep all that whole moves must."""
+        low, high = (whole(values[self.constants.integer]) for values in self.limits)
+        return bool(satisfied(self.chains, whole(x[self.constants.integer])[None], low, high)[0])
+
     def rounded(self, moves: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray | None:
         """Whole moves near `moves` that satisfy the hard rows, or None where there are none; see `nearest`."""
         point = np.clip(whole(moves), lower, upper)

@@ -176,6 +176,9 @@ def enumerate_below(
         k, b = owner[int(column)]
         chain = chains[k]
         domain = np.arange(int(lower[column]), int(upper[column]) + 1)
+        if chain.allowed is not None:  # few of many moves end where they may
+            away = np.unique(chain.allowed[:, None] - np.unique(position[:, k]))
+            domain = np.intersect1d(domain, away[away % chain.counts[b] == 0] // chain.counts[b])
         if len(bounds) * len(domain) > CELLS:
             if beam is None:
                 return None
@@ -191,6 +194,11 @@ def enumerate_below(
         good = (reached >= chain.low[b]) & (reached <= chain.high[b])
         if chain.coupled[b]:
             good &= np.abs(domain - moves[:, place[chain.columns[b - 1]], None]) <= 1
+        if chain.allowed is not None:
+            good &= chain.passes(b, position[:, k, None], domain)
+        if chain.apart is not None:
+            near = [place[column] for column in chain.columns[:b][chain.apart[b, :b]]]
+            good &= (domain == 0) | (moves[:, near] == 0).all(axis=1, keepdims=True)
         below = total < cutoff
         if np.isfinite(cutoff):
             out = good & ~below

@@ -65,8 +65,9 @@ def outer_approximation(
         if point is None or not finished:
             return False, best_bound
         search.nodes += 1
+        allowed = not search.restricted or satisfied(search.chains, point[None], lower, upper)[0]
         # rounding of the master, or moves that nothing can follow: what they are worth is known, what is left matters
-        if tangents.knows(point) or (search.followed and point.tobytes() in search.seen):
+        if tangents.knows(point) or not allowed or (search.followed and point.tobytes() in search.seen):
             master.forbid(point)
         points = around(search.chains, point, lower, upper)
 

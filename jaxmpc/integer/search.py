@@ -4,7 +4,8 @@ One loop carries what to solve next: first the problem itself, then its rounded 
 list. The prices of the root leave a list of whole moves that may be better than the incumbent (`lower_bound`,
 `listing`), and the best of the list are solved one after the other, each with a quadratic cut that bounds all others
 (`cuts`), until none is left. What does not fit (moves of more than one step, rounded moves that break a hard row, longer
-lists) is left to `integer.solve`, which goes on from the relaxation.
+lists) is left to `integer.solve`, which goes on from the relaxation; so are whole moves that must keep more than limits and
+hard rows (`actuators`).
 """
 
 from __future__ import annotations
@@ -218,6 +219,8 @@ class _Search(NamedTuple):
             root.status == OPTIMAL,
             closes(value, jnp.minimum(bound, value), self.tables.scale, self.gap),
         )
+        if self.tables.complete is not None:  # what else there is to keep is known on the host only
+            closed &= self.tables.complete | self.none
         first = jnp.clip(jnp.round(self.of(root.warm.x)), low, high)
         usable = found & self.tables.known & ~self.none
         usable &= jnp.all((low >= -1.0) & (high <= 1.0) & (low <= high))

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
+from jaxmpc.integer.actuators import Actuator
 from jaxmpc.integer.branch_and_bound import branch_and_bound
 from jaxmpc.integer.cuts import Cuts
 from jaxmpc.integer.enumeration import enumerate_all
@@ -50,6 +51,7 @@ def solve_integers(
     root: Relaxations,
     *,
     starts: Sequence[Sequence[np.ndarray]],
+    actuators: Sequence[Sequence[Actuator]] = (),
     gap: float = 1e-6,
     time_limit: float | None = None,
     finish: str = "auto",
@@ -63,6 +65,7 @@ def solve_integers(
         instances: their problems, first axis ``"scenario"``, with NumPy's arrays.
         root: their relaxations.
         starts: integer moves to try as incumbents, per scenario ``"integer"`` [steps]; they never change the answer.
+        actuators: what the integer MVs must keep besides limits and rows, per scenario; none if that is all.
         gap: relative gap at which a solve stops.
         time_limit: seconds of work per scenario; the best plan so far is returned with its true gap.
         finish: ``auto``, or the one path that has to close the problems after fixing.
@@ -76,11 +79,16 @@ def solve_integers(
     searches = []
     for i in range(len(results)):
         bound, value = max(float(root.bound[i]), 0.0), float(root.snapped[i])
-        if finish == "auto" and closes(value, bound, relaxer.scenario(i).scale, gap):
+        closed = finish == "auto" and closes(value, bound, relaxer.scenario(i).scale, gap)
+        if closed and not actuators:
             results[i] = _closed_by_root(relaxer, root, i, bound, spent)
             continue
         own = jax.tree.map(lambda leaf, i=i: leaf[i], instances)
-        search = Search(relaxer.scenario(i), own, root.part(i, i + 1), gap, time_limit)
+        rest = actuators[i] if actuators else ()
+        search = Search(relaxer.scenario(i), own, root.part(i, i + 1), gap, time_limit, rest)
+        if closed and search.allows(root.x[i]):
+            results[i] = _closed_by_root(relaxer, root, i, bound, spent)
+            continue
         search.spent = spent
         searches.append((i, search, _line(search, starts[i], finish, last)))
     done = run(relaxer, instances, searches)
@@ -141,7 +149,7 @@ def _line(search: Search, starts: Sequence[np.ndarray], finish: str, last: bool)
             return search.finish("fixing" if finish == "auto" else finish, np.inf)
         if (lower == upper).all() and finish == "auto":
             only = search.new([lower])
-            if len(only):
+            if len(only) and satisfied(search.chains, only, lower, upper)[0]:
                 yield from search.evaluate(only)
             return search.finish("fixing", np.inf)
     if finish in ("auto", "enumeration"):

@@ -40,6 +40,7 @@ class Tables(eqx.Module):
         slope: of the envelope of every move.
         own_weight: see `cuts`.
         scale: see `gap.closes`.
+        complete: whether limits and hard rows are all that whole moves must keep; None where that is so in every lane.
     """
 
     count: Int[Array, ""]
@@ -56,6 +57,7 @@ class Tables(eqx.Module):
     slope: Float[Array, "level integer"]
     own_weight: Float[Array, " integer"]
     scale: Float[Array, ""]
+    complete: Bool[Array, ""] | None = None
 
 
 class Constants:
@@ -131,11 +133,15 @@ class Constants:
         value = (weight * w**2 - own * w + own * k - weight * k**2).sum()
         return float(value), self.reached.T @ (2.0 * weight * w - own)
 
-    def tables(self, integers: int) -> Tables:
-        """For the compiled search, with room for so many integer moves."""
+    def tables(self, integers: int, restricted: bool = False) -> Tables:
+        """For the compiled search, with room for so many integer moves.
+
+        Args:
+            restricted: whether in any lane there is more to keep than limits and hard rows.
+        """
         structure, size, order = self.structure, self.size, self.order
         count, room = len(order), integers - len(order)
-        known = room >= 0 and structure.mean_move_mode != "predictive"
+        known = room >= 0 and structure.mean_move_mode != "predictive" and not structure.has_gaps_or_dwell
         if not known:
             order, count, room = order[:integers], min(count, integers), max(room, 0)
         place, previous = self.position, self._before(self.block[:, None] - 1 == self.block[None, :])
@@ -164,6 +170,7 @@ class Constants:
             slope=np.pad(self.slope[:, order], ((0, 0), (0, room))),
             own_weight=padded(one(self.own_weight)),
             scale=np.asarray(self.scale),
+            complete=np.asarray(not structure.has_gaps_or_dwell) if restricted else None,
         )
         return Tables(**fields)
 
