@@ -18,9 +18,10 @@ from numpy.typing import ArrayLike
 from jaxmpc import html
 from jaxmpc import status as codes
 from jaxmpc.controller.case import check_position, step_array
-from jaxmpc.controller.controller import Controllers, check_finish, in_one_call, one_lane
+from jaxmpc.controller.controller import Controllers, check_finish, known_of, one_lane
 from jaxmpc.controller.core import Core
 from jaxmpc.controller.sample import require_double_precision
+from jaxmpc.integer.feasible import held_within
 from jaxmpc.integer.finish import finish_steps
 from jaxmpc.integer.host_search import SearchResult
 from jaxmpc.integer.relaxer import Relaxations
@@ -30,10 +31,9 @@ from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.blocking import moves_per_block, sample_moves
 from jaxmpc.problem.condense import dynamic_matrix
 from jaxmpc.problem.instance import QpInstance, make_instance
-from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
-from jaxmpc.programs.clock import Clock
+from jaxmpc.programs.clock import Clock, in_time
 from jaxmpc.programs.compilation import compiling_for
 from jaxmpc.programs.lanes import Lanes
 from jaxmpc.programs.packing import PackedCall
@@ -95,7 +95,7 @@ def _one_posed(
         recover=settings[2] > 0,
     )
     tables = eqx.tree_at(lambda t: t.known, core.tables, core.tables.known & (settings[1] > 0))
-    return instance, decide(core.qp, tables, instance, start, settings[0])
+    return instance, decide(core.qp, tables, instance, start, settings[0], settings[3])
 
 
 def _posed(cores: Lanes[Core], *given) -> tuple[QpInstance, Decision]:
@@ -156,12 +156,24 @@ class Planner:
             start = jax.tree.map(lambda leaf: np.asarray(leaf)[None], warm)
         whole = self.controllers.over_horizon
         known = whole(free_response[None]), whole(setpoint[None]), mv_now[None], as_array(last_move)[None]
-        settings = np.array([[gap, float(in_one_call(finish, time_limit)), float(recover)]])
         clock, own = Clock(), self.controllers
-        with compiling_for(str(own.size)):
-            instance, found = self._pose(own.cores, own.flat, *known, past, start, settings)
-        result = self._decided(instance, found, previous_moves, gap, time_limit, finish, clock.seconds)
-        return self._plan(one_lane(instance), result, mv_now, free_response, setpoint, gap, clock)
+        left = lambda: None if time_limit is None else time_limit - clock.seconds  # noqa: E731
+        with compiling_for(str(own.size)), in_time(time_limit):
+            while True:
+                most, one = own.pace.steps_within(left()), Clock()
+                settings = np.array([[gap, float(finish == "auto"), float(recover), most]])
+                instance, found = self._pose(own.cores, own.flat, *known, past, start, settings)
+                steps, root = int(found.steps[0]), found.root
+                own.pace.took(one.seconds, steps)
+                if (
+                    root.steps[0] < most
+                    or root.status[0] == codes.OPTIMAL
+                    or not own.pace.steps_within(left())
+                ):
+                    break
+                start = root.warm  # there was more time than it was given
+            result = self._decided(instance, found, previous_moves, gap, time_limit, finish, clock.seconds)
+            return self._plan(one_lane(instance), result, mv_now, free_response, setpoint, gap, clock)
 
     def _decided(
         self,
@@ -194,6 +206,7 @@ class Planner:
             time_limit=time_limit,
             finish=finish,
             spent=spent,
+            known=None if time_limit is None else known_of(decision),
         )
         return result
 
@@ -223,7 +236,7 @@ class Planner:
         core, size = self.controllers.cores.shared, self.controllers.size
         x = np.array(result.x)
         x = np.where(np.asarray(core.qp.whole), np.round(x), x)
-        x = _repair(self.structure, size, instance, x)
+        x = held_within(self.structure, size, instance, x)  # solver tolerance is taken out
         moves = (x * np.asarray(core.qp.scale)).reshape(size.mvs, -1).T[: self.structure.block_count]
         objective, cv, eps = self.objective(moves, free_response, setpoint)
         bound = min(result.bound, objective)
@@ -269,22 +282,6 @@ class Planner:
             + (tuning.slack_weight * (eps_high + eps_low)).sum()
         )
         return float(value), cv, (eps_high, eps_low)
-
-
-def _repair(structure: Structure, size: Size, instance: QpInstance, x: np.ndarray) -> np.ndarray:
-    """Take solver tolerance out of the continuous moves: clip moves, then positions, block after block."""
-    by_mv = lambda values: np.reshape(values, (size.mvs, -1))  # noqa: E731
-    lower, upper = by_mv(instance.lower), by_mv(instance.upper)
-    row_low, row_high = by_mv(instance.row_low), by_mv(instance.row_high)
-    x, counts = x.copy(), moves_per_block(structure)
-    for mv in sorted(set(range(size.mvs)) - set(structure.integer_mvs)):
-        position, own = 0.0, by_mv(x)[mv]
-        for b in range(structure.block_count):
-            low = max(lower[mv, b], (row_low[mv, b] - position) / counts[b])
-            high = min(upper[mv, b], (row_high[mv, b] - position) / counts[b])
-            own[b] = min(max(own[b], low), high) if low <= high else own[b]
-            position += counts[b] * own[b]
-    return x
 
 
 _matrix = jax.jit(dynamic_matrix)

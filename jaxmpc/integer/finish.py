@@ -6,7 +6,7 @@ Between `integer.solve`, which knows scaled problems only, and its callers, whic
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from jaxmpc.errors import InputError
 from jaxmpc.integer.feasible import UndecidedError, chains_of, nearest, whole
-from jaxmpc.integer.host_search import SearchResult
+from jaxmpc.integer.host_search import Known, SearchResult
 from jaxmpc.integer.relaxer import Relaxations, Relaxer
 from jaxmpc.integer.solve import solve_integers
 from jaxmpc.integer.tables import Constants
@@ -24,6 +24,7 @@ from jaxmpc.problem.instance import QpInstance
 from jaxmpc.problem.memory import check_ranges
 from jaxmpc.programs.clock import Clock
 from jaxmpc.relaxed.gap import closes
+from jaxmpc.relaxed.newton import MOST_STEPS
 from jaxmpc.status import LIMIT, OPTIMAL
 
 WIDEST_ENVELOPE = 4  # steps up to which the envelope of the squared integer move is built
@@ -38,7 +39,8 @@ def finish_steps(
     gap: float,
     time_limit: float | None,
     finish: str,
-    spent: float = 0.0,
+    spent: float | Float[np.ndarray, " scenario"] = 0.0,
+    known: Sequence[Known] | None = None,
 ) -> list[SearchResult]:
     """Solve one step of every scenario; all have the same integer moves.
 
@@ -51,6 +53,7 @@ def finish_steps(
         time_limit: seconds of work per scenario, None for none.
         finish: one of `integer.solve.FINISHES`.
         spent: seconds that every scenario has taken already.
+        known: what the compiled search has found for moves of one step, per scenario.
 
     Returns:
         How the steps ended.
@@ -67,20 +70,36 @@ def finish_steps(
     if widest > 1:
         relaxer = relaxer_of(widest if widest <= WIDEST_ENVELOPE else 0)
         instances = eqx.tree_at(lambda i: (i.lower, i.upper), instances, (lower, upper))
-        root = relaxer.solve_roots(instances, relaxer.cold(instances))
+        most = relaxer.pace.steps_within(_left(time_limit, spent, clock))
+        root = relaxer.solve_roots(instances, relaxer.cold(instances), most)
+        known = None  # (6.6) of more than one step is more than the compiled search pays
+    elif time_limit is not None and ((root.status != OPTIMAL) & (root.steps < MOST_STEPS)).any():
+        # the time it was given was a guess
+        most = relaxer.pace.steps_within(_left(time_limit, spent, clock))
+        if most > 0:
+            root = relaxer.solve_roots(instances, root.warm, most)
     starts = []
     for i, moves in enumerate(previous_moves):
         own = relaxer.scenario(i)
         wanted = moves.T.reshape(-1)[own.integer] / own.scales[own.integer]
         starts.append([np.clip(np.nan_to_num(wanted), -1e6, 1e6)])
     rest: dict[str, Any] = dict(gap=gap, time_limit=time_limit, finish=finish)
-    spent += clock.seconds / len(starts)
-    found = solve_integers(relaxer, instances, root, starts=starts, last=False, spent=spent, **rest)
+    used = np.broadcast_to(spent + clock.seconds / len(starts), len(starts))
+    found = solve_integers(
+        relaxer, instances, root, starts=starts, last=False, spent=used, known=known, **rest
+    )
     for i, result in enumerate(found):
-        late = time_limit is not None and result.seconds >= time_limit
-        if result.status == LIMIT and not late and relaxer.scenario(i).chord_weight.any():
-            found[i] = _tightened(relaxer, instances, i, result, starts[i], rest)
+        left = None if time_limit is None else time_limit - result.seconds
+        if result.status == LIMIT and (left is None or left > 0):
+            weight = relaxer.scenario(i).chords_within(left)
+            if weight is not None and weight.any():
+                found[i] = _tightened(relaxer, instances, i, result, starts[i], rest)
     return found
+
+
+def _left(time_limit: float | None, spent, clock: Clock) -> float | None:
+    """Seconds that the scenario with the least still has."""
+    return None if time_limit is None else time_limit - float(np.max(spent)) - clock.seconds
 
 
 def _tightened(
@@ -89,10 +108,12 @@ def _tightened(
     """The search of one scenario that is still open, on its tighter relaxation."""
     clock, own = Clock(), relaxer.with_chords(index)
     one = jax.tree.map(lambda leaf: leaf[index : index + 1], instances)
-    root = own.solve_roots(one, own.cold(one))
+    most = own.pace.steps_within(_left(rest["time_limit"], found.seconds, clock))
+    root = own.solve_roots(one, own.cold(one), most)
     if found.x is not None:
         starts = [*starts, whole(found.x[own.scenario(0).integer])]
-    (result,) = solve_integers(own, one, root, starts=[starts], spent=found.seconds + clock.seconds, **rest)
+    used = np.array([found.seconds + clock.seconds])
+    (result,) = solve_integers(own, one, root, starts=[starts], spent=used, **rest)
     result.nodes, result.root = result.nodes + found.nodes, found.root
     bound = max(result.bound, found.bound)
     if found.value < result.value:  # time ran out before the second search came so far

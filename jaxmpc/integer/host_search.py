@@ -6,14 +6,24 @@ search is a generator: it yields what it needs solved and is sent the results, s
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Generator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from jaxmpc.integer.feasible import UNBOUNDED, Chain, chains_of, nearest, satisfied, whole
+from jaxmpc.integer.feasible import (
+    UNBOUNDED,
+    Chain,
+    UndecidedError,
+    chains_of,
+    held_within,
+    nearest,
+    satisfied,
+    whole,
+)
 from jaxmpc.integer.lower_bound import LowerModel
 from jaxmpc.integer.relaxer import LaneLimits, Relaxations
 from jaxmpc.integer.tables import Constants
@@ -29,10 +39,15 @@ GROUP = 8  # problems a search asks for at once: as many as one small batch hold
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """Relaxed problems a search wants solved: their limits and where to start, first axis ``"lane"``."""
+    """Relaxed problems a search wants solved: their limits and where to start, first axis ``"lane"``.
+
+    Where they are only `evaluated`, no Newton step is taken. The answer holds as many of them, the first ones, as the time
+    limit leaves time for; None for none.
+    """
 
     limits: LaneLimits
     starts: WarmStart
+    evaluated: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +55,10 @@ class Offload:
     """Work outside the device (a MILP) that a search wants done in a thread."""
 
     work: Callable[[], Any]
+
+
+class OutOfTimeError(Exception):
+    """The time limit of a search is used up, or the next piece of its work would not end in time."""
 
 
 Steps = Generator[Request | Offload, Any, Any]  # a search, or a part of one
@@ -57,6 +76,14 @@ class SearchResult:
     nodes: int
     root: WarmStart | None = None
     seconds: float = 0.0
+
+
+class Known(NamedTuple):
+    """What is known of a problem before its search: scaled moves, their value (infinite for none), and a bound."""
+
+    x: np.ndarray
+    value: float
+    bound: float
 
 
 class Search:
@@ -88,6 +115,7 @@ class Search:
         self.root_bound = max(float(root.bound[0]), 0.0)  # every term of (6.6) is non-negative
         self.value, self.x = np.inf, None
         self.left_out = np.inf  # least bound of everything that was discarded
+        self.still_open = -np.inf  # least bound of what is open, as far as it is known
         self.nodes = 1
         self.seen: set[bytes] = set()
         self.spent = 0.0  # seconds of work so far, kept by the scheduler,
@@ -108,12 +136,32 @@ class Search:
         """Whether the time limit is used up."""
         return self.time_limit is not None and self._used() >= self.time_limit
 
+    def check_time(self) -> None:
+        """Called inside whatever may take longer than a millisecond.
+
+        Raises:
+            OutOfTimeError: where the time limit is used up.
+        """
+        if self.out_of_time():
+            raise OutOfTimeError
+
     def _used(self) -> float:
         return self.spent + (self.clock.seconds if self.clock else 0.0)
 
     def seconds_left(self) -> float | None:
         """Seconds to the time limit, None without one."""
         return None if self.time_limit is None else max(self.time_limit - self._used(), 0.0)
+
+    def take(self, known: Known) -> None:
+        """Start from what others have found."""
+        self.root_bound = max(self.root_bound, known.bound)
+        if known.value < self.value:
+            self.value, self.x = known.value, known.x.copy()
+
+    def may_tighten(self) -> bool:
+        """Whether chords tighten the relaxation, as far as there is time to find out."""
+        weight = self.constants.chords_within(self.seconds_left())
+        return weight is not None and bool(weight.any())
 
     def discard(self, bound: float) -> None:
         """Record the bound of something that is not searched further."""
@@ -126,6 +174,7 @@ class Search:
         upper: np.ndarray,
         starts: list[WarmStart] | None = None,
         positions: tuple[np.ndarray, np.ndarray] | None = None,
+        evaluated: bool = False,
     ) -> Steps:
         """Solve relaxed problems with integer limits ``"batch integer"``; returns `Relaxations`.
 
@@ -135,6 +184,10 @@ class Search:
             starts: prices to start from, one per problem; the root's if not given.
             positions: lower and upper limits of the position after every integer move [steps]; the problem's own if not
                 given.
+            evaluated: whether the moves of the starts are evaluated only.
+
+        Raises:
+            OutOfTimeError: where there is no time for all of them; those that are solved were offered as incumbents.
         """
         count, integer = len(lower), self.constants.integer
         own = *self.limits, np.asarray(self.instance.row_low), np.asarray(self.instance.row_high)
@@ -148,7 +201,13 @@ class Search:
             stacked = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape)), self.start)
         else:
             stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *starts)
-        return (yield Request(limits, stacked))
+        result = yield Request(limits, stacked, evaluated)
+        solved = 0 if result is None else len(result.bound)
+        if solved < count:
+            for lane in range(solved):
+                self.offer(result, lane)
+            raise OutOfTimeError
+        return result
 
     def offer(self, result: Relaxations, lane: int) -> None:
         """Take a solved problem with its integer moves rounded as incumbent if that is better."""
@@ -205,13 +264,34 @@ class Search:
         point = np.clip(whole(moves), lower, upper)
         if satisfied(self.chains, point[None], lower, upper)[0]:
             return point
-        point = nearest(self.chains, moves, lower, upper)
+        point = nearest(self.chains, moves, lower, upper, self.check_time)
         return point if point is not None and satisfied(self.chains, point[None], lower, upper)[0] else None
 
     def new(self, points: Sequence[np.ndarray | None]) -> np.ndarray:
         """The points that have not been evaluated yet, each once, ``"point integer"``."""
         fresh = {p.tobytes(): p for p in points if p is not None and p.tobytes() not in self.seen}
         return np.array(list(fresh.values())).reshape(len(fresh), len(self.constants.integer))
+
+    def salvaged(self, starts: Sequence[np.ndarray]) -> Steps:
+        """Without a plan at the end of the time: one that needs no solve, near the relaxed moves, a start, or no moves."""
+        c = self.constants
+        low, high = (whole(limits[c.integer]) for limits in self.limits)
+        relaxed = np.nan_to_num(self.root.x[0])
+        for wanted in (relaxed[c.integer], *starts, np.zeros(len(low))):
+            point = np.clip(whole(wanted), low, high)
+            if satisfied(self.chains, point[None], low, high)[0]:
+                break
+        else:
+            with contextlib.suppress(UndecidedError):
+                point = nearest(self.chains, relaxed[c.integer], low, high)
+            if point is None or not satisfied(self.chains, point[None], low, high)[0]:
+                return
+        x = held_within(c.structure, c.size, self.instance, relaxed)
+        x[c.integer] = point
+        start = dataclasses.replace(self.start, x=x)
+        with contextlib.suppress(OutOfTimeError):
+            result = yield from self.relax(point[None], point[None], [start], evaluated=True)
+            self.offer(result, 0)
 
     # ---- finishing
     def finish(self, by: str | None, bound: float) -> SearchResult:

@@ -134,9 +134,13 @@ def diagonal_share(curvature: np.ndarray) -> np.ndarray:
 
 def _listed(search: Search, model: LowerModel, lower, upper) -> np.ndarray:
     """Candidates below the incumbent; good ones only where there are too many."""
-    found = enumerate_below(model, search.chains, lower, upper, search.cutoff, LISTED)
+    found = enumerate_below(
+        model, search.chains, lower, upper, search.cutoff, LISTED, check_time=search.check_time
+    )
     if found is None:
-        found = enumerate_below(model, search.chains, lower, upper, search.cutoff, None, beam=BEAM)
+        found = enumerate_below(
+            model, search.chains, lower, upper, search.cutoff, None, beam=BEAM, check_time=search.check_time
+        )
     points = np.zeros((0, len(lower)), dtype=int) if found is None else found[0]
     return points[satisfied(search.chains, points, lower, upper)]
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmpc.problem.condense import CondensedQp
@@ -40,9 +41,11 @@ def solve_relaxed(
 
 
 @one_by_one
-def solve_lane(qp: CondensedQp, instance: QpInstance, lower, upper, start: WarmStart) -> QpSolution:
-    """`solve_relaxed` from a start."""
-    return refine(prepare(qp, instance, lower, upper), start)
+def solve_lane(
+    qp: CondensedQp, instance: QpInstance, lower, upper, start: WarmStart, most: Array | float = np.inf
+) -> QpSolution:
+    """`solve_relaxed` from a start, in so many Newton steps at most; its certificate is what they reach."""
+    return refine(prepare(qp, instance, lower, upper), start, most)
 
 
 def cold_start(qp: CondensedQp, instance: QpInstance) -> WarmStart:
