@@ -84,21 +84,20 @@ class Batch:
     gap: float
     time_limit: float | None
     finish: str
+    pace: Pace  # of compiled steps as far as it is known
     decided: bool = False  # whether a step has been
-    pace: Pace | None = None  # of compiled steps as far as it is known
 
     def __post_init__(self):
         self.count, self.size = self.scenarios.count, self.scenarios.size
         self.structure = self.scenarios.structures[0]
         self._step = PackedCall(_stepped)
-        self.pace = pace_of(self.size) if self.pace is None else self.pace
 
     def part(self, index: np.ndarray) -> Batch:
         """The controllers of some scenarios, which share what is computed already."""
         if self.count == len(index) and (index == np.arange(self.count)).all():
             return self
         relaxers = self.relaxers.part(index)
-        own = self.gap, self.time_limit, self.finish, self.decided, self.pace
+        own = self.gap, self.time_limit, self.finish, self.pace, self.decided
         return Batch(relaxers.scenarios, self.cores.take(index), relaxers, *own)
 
     def repeated(self, count: int) -> Batch:
@@ -113,7 +112,7 @@ class Batch:
     @property
     def most(self) -> Float[np.ndarray, " scenario"]:
         """Newton steps of a compiled step that fit the time limit, infinite where there are no integer MVs or no limit."""
-        return np.where(self.integer, self.pace.steps_within(self.time_limit), np.inf)
+        return np.where(self.integer, self.pace.steps_within(self.pace.before_tail(self.time_limit)), np.inf)
 
     @property
     def settings(self) -> Float[np.ndarray, "scenario 3"]:
@@ -172,6 +171,8 @@ class Batch:
             leaves, form = self.flat
             state, moves = jax.tree.map(np.asarray, _carry_out(leaves, moment, x, good, form))
             fields |= dict(move=moves[:, 0], mv=state.mv, moves=moves)
+            if self.time_limit is not None and self.count == 1 and fields["status"][0] == codes.LIMIT:
+                self.pace.ended(clock.seconds - self.time_limit)
         self.decided = True
         return state, dataclasses.replace(info, **fields)
 
@@ -226,7 +227,7 @@ class Batch:
                     Relaxations.of(own.decision.root),
                     previous_moves=own.state.plan,  # pyright: ignore[reportArgumentType]
                     gap=self.gap,
-                    time_limit=self.time_limit,
+                    time_limit=self.pace.before_tail(self.time_limit),
                     finish=self.finish,
                     spent=spent,
                     known=None if self.time_limit is None else known_of(own.decision),
@@ -274,7 +275,8 @@ class Controllers(Batch):
             qps = scenarios.problems(1)
         constants = scenarios.constants(qps) if scenarios.integers else []
         relaxers = Relaxers(scenarios, {1: Relaxer(qps, constants)} if scenarios.integers else {})
-        super().__init__(scenarios, scenarios.core(qps, constants), relaxers, *options)
+        cores, pace = scenarios.core(qps, constants), pace_of(scenarios.size)
+        super().__init__(scenarios, cores, relaxers, *options, pace)
 
 
 def check_finish(finish: str) -> str:

@@ -157,7 +157,8 @@ class Planner:
         whole = self.controllers.over_horizon
         known = whole(free_response[None]), whole(setpoint[None]), mv_now[None], as_array(last_move)[None]
         clock, own = Clock(), self.controllers
-        left = lambda: None if time_limit is None else time_limit - clock.seconds  # noqa: E731
+        until = own.pace.before_tail(time_limit)
+        left = lambda: None if until is None else until - clock.seconds  # noqa: E731
         with compiling_for(str(own.size)), in_time(time_limit):
             while True:
                 most, one = own.pace.steps_within(left()), Clock()
@@ -165,15 +166,14 @@ class Planner:
                 instance, found = self._pose(own.cores, own.flat, *known, past, start, settings)
                 steps, root = int(found.steps[0]), found.root
                 own.pace.took(one.seconds, steps)
-                if (
-                    root.steps[0] < most
-                    or root.status[0] == codes.OPTIMAL
-                    or not own.pace.steps_within(left())
-                ):
+                if root.steps[0] < most or root.status[0] == codes.OPTIMAL or not own.pace.fits(left()):
                     break
                 start = root.warm  # there was more time than it was given
-            result = self._decided(instance, found, previous_moves, gap, time_limit, finish, clock.seconds)
-            return self._plan(one_lane(instance), result, mv_now, free_response, setpoint, gap, clock)
+            result = self._decided(instance, found, previous_moves, gap, until, finish, clock.seconds)
+            plan = self._plan(one_lane(instance), result, mv_now, free_response, setpoint, gap, clock)
+        if time_limit is not None and result.status == codes.LIMIT:
+            own.pace.ended(clock.seconds - time_limit)
+        return plan
 
     def _decided(
         self,

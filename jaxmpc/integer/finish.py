@@ -72,12 +72,13 @@ def finish_steps(
         instances = eqx.tree_at(lambda i: (i.lower, i.upper), instances, (lower, upper))
         most = relaxer.pace.steps_within(_left(time_limit, spent, clock))
         root = relaxer.solve_roots(instances, relaxer.cold(instances), most)
-        known = None  # (6.6) of more than one step is more than the compiled search pays
+        # (6.6) of more than one step is more than the compiled search pays
+        known = None if known is None else [one._replace(value=np.inf) for one in known]
     elif time_limit is not None and ((root.status != OPTIMAL) & (root.steps < MOST_STEPS)).any():
         # the time it was given was a guess
-        most = relaxer.pace.steps_within(_left(time_limit, spent, clock))
-        if most > 0:
-            root = relaxer.solve_roots(instances, root.warm, most)
+        left = _left(time_limit, spent, clock)
+        if relaxer.pace.fits(left):
+            root = relaxer.solve_roots(instances, root.warm, relaxer.pace.steps_within(left))
     starts = []
     for i, moves in enumerate(previous_moves):
         own = relaxer.scenario(i)

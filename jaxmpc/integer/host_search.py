@@ -202,9 +202,10 @@ class Search:
         else:
             stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *starts)
         result = yield Request(limits, stacked, evaluated)
-        solved = 0 if result is None else len(result.bound)
-        if solved < count:
-            for lane in range(solved):
+        if result is None:
+            raise OutOfTimeError
+        if len(result.bound) < count:
+            for lane in range(len(result.bound)):
                 self.offer(result, lane)
             raise OutOfTimeError
         return result

@@ -47,7 +47,7 @@ def solve_integers(
     finish: str = "auto",
     last: bool = True,
     spent: Sequence[float] | np.ndarray | None = None,
-    known: Sequence[Known | None] | None = None,
+    known: Sequence[Known] | None = None,
 ) -> list[SearchResult]:
     """Search the problems of many scenarios side by side on the host.
 
@@ -61,7 +61,7 @@ def solve_integers(
         finish: ``auto``, or the one path that has to close the problems after fixing.
         last: whether to go on where lists are too long and chords would tighten the relaxation.
         spent: seconds that the scenarios have taken already, none if not given.
-        known: plans and bounds of the scenarios that others have found, None for none.
+        known: plans and bounds of the scenarios that others have found.
 
     Returns:
         One result per scenario; ``status.INFEASIBLE`` when no whole moves satisfy the hard limits.
@@ -76,7 +76,7 @@ def solve_integers(
         own = jax.tree.map(lambda leaf, i=i: leaf[i], instances)
         search = Search(relaxer.scenario(i), own, root.part(i, i + 1), gap, time_limit)
         search.spent = float(spent[i])
-        if known is not None and known[i] is not None:
+        if known is not None:
             search.take(known[i])
         searches.append((i, search, _line(search, starts[i], finish, last)))
     done = run(relaxer, instances, searches)

@@ -25,7 +25,7 @@ SECONDS, LOADING = (
     6e-7,
     1.0,
 )  # what the programme takes by the fourth power of the positions; loading its solver
-TIMES = 3.0  # share of the time left that it may take is the inverse: the search needs the rest
+TIMES = 4.0  # share of the time left that it may take is the inverse: the search needs the rest
 SAFE = 1e-9  # share of the curvature that stays, so that rounding leaves the objective convex
 
 

@@ -6,7 +6,10 @@ after the other, so that each takes the steps it needs (`programs.lanes`).
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -50,7 +53,8 @@ def solve_lane(
 
 def cold_start(qp: CondensedQp, instance: QpInstance) -> WarmStart:
     """A start that knows nothing: no moves, no prices."""
-    none = jnp.zeros_like
+    # on the host NumPy makes zeros in no time
+    none: Any = jnp.zeros_like if isinstance(instance.lower, jax.Array) else np.zeros_like
     x, hard = none(instance.lower), none(instance.row_low)
     position = hard[: 0 if qp.position_weight is None else hard.shape[0]]
     return WarmStart(x, none(instance.offset), none(qp.steep), position, none(instance.limit_high), x, hard)
