@@ -208,8 +208,13 @@ def dump_case(case: Case, path: str | Path) -> Path:
 
 
 def plan_to_dict(plan: Any) -> dict[str, Any]:
-    """The content of a plan file: the fields of a `Plan`, with null where a number is not finite."""
-    return {name: _plain(getattr(plan, name)) for name in _PLAN}
+    """The content of a plan file: the fields of a `Plan`, with null where a number is not finite.
+
+    The reason is there only where the plan is not optimal.
+    """
+    reason = getattr(plan, "reason", None)
+    body = {name: _plain(getattr(plan, name)) for name in _PLAN}
+    return body if reason is None else body | {"reason": reason}
 
 
 def _plain(value: Any) -> Any:

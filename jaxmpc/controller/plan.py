@@ -23,7 +23,7 @@ from jaxmpc.controller.core import Core
 from jaxmpc.controller.sample import require_double_precision
 from jaxmpc.integer.feasible import held_within
 from jaxmpc.integer.finish import finish_steps
-from jaxmpc.integer.host_search import SearchResult
+from jaxmpc.integer.host_search import SearchResult, no_whole_moves
 from jaxmpc.integer.relaxer import Relaxations
 from jaxmpc.integer.search import Decision, Relaxed, decide
 from jaxmpc.integer.solve import continuous_feasible
@@ -38,7 +38,9 @@ from jaxmpc.programs.compilation import compiling_for
 from jaxmpc.programs.lanes import Lanes
 from jaxmpc.programs.packing import PackedCall
 from jaxmpc.relaxed.gap import check_gap, check_time_limit, closes, relative_gap
-from jaxmpc.relaxed.newton import WarmStart
+from jaxmpc.relaxed.newton import MOST_STEPS, WarmStart
+
+ROUNDED = "rounding leaves objective and bound farther apart than the gap that is asked for"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +48,8 @@ class Plan:
     """A solved controller step, in engineering units.
 
     Attributes:
-        status: ``optimal``, ``limit`` (feasible, not proven within the gap), ``infeasible`` or ``failed``.
+        status: ``optimal``, ``limit`` (the time limit came before the proof), ``unproven`` (something else did, as `reason`
+            says), ``infeasible`` or ``failed``.
         objective: (6.6) with all constants; None without a plan.
         bound: proven lower bound of the objective.
         gap: relative gap between the two.
@@ -57,6 +60,7 @@ class Plan:
         nodes: relaxations solved in the search.
         solve_time_s: wall time of the solve without compilation [s].
         finished_by: which path closed the problem, None if none did.
+        reason: a sentence that says why the plan is not optimal, None where it is.
         warm: prices of the root relaxation, a start for the next sample.
     """
 
@@ -72,6 +76,7 @@ class Plan:
     nodes: int
     solve_time_s: float
     finished_by: str | None
+    reason: str | None = None
     warm: WarmStart | None = None
 
     def _repr_html_(self) -> str:
@@ -188,7 +193,8 @@ class Planner:
         """How the step ended, by the compiled program or on the host."""
         found = one_lane(decision)
         if not self.structure.integer_mvs:
-            return self._relaxed(one_lane(instance), found.root, gap)
+            stopped = time_limit is not None and found.root.steps < MOST_STEPS
+            return self._relaxed(one_lane(instance), found.root, gap, stopped)
         start = found.root.warm
         if found.closed and finish == "auto":
             by = codes.FINISHERS[int(found.finished_by)]
@@ -210,17 +216,21 @@ class Planner:
         )
         return result
 
-    def _relaxed(self, instance: QpInstance, root: Relaxed, gap: float) -> SearchResult:
-        """The problem without integers: one relaxation."""
+    def _relaxed(self, instance: QpInstance, root: Relaxed, gap: float, stopped: bool) -> SearchResult:
+        """The problem without integers: one relaxation, which the time limit may have stopped."""
         if not continuous_feasible(self.structure, self.controllers.size, instance):
-            return SearchResult(None, np.inf, np.inf, codes.INFEASIBLE, None, 0)
+            return no_whole_moves()
         if not np.isfinite(root.warm.x).all():
-            return SearchResult(None, np.inf, -np.inf, codes.FAILED, None, 1)
+            why = "the relaxation was not solved: its numbers are not finite"
+            return SearchResult(None, np.inf, -np.inf, codes.FAILED, None, 1, reason=why)
         value = float(root.objective)
         bound = min(max(float(root.bound), 0.0), value)
-        closed = closes(value, bound, self._unit, gap)
-        status, by = (codes.OPTIMAL, "relaxation") if closed else (codes.LIMIT, None)
-        return SearchResult(np.asarray(root.warm.x), value, bound, status, by, 1, root.warm)
+        x = np.asarray(root.warm.x)
+        if closes(value, bound, self._unit, gap):
+            return SearchResult(x, value, bound, codes.OPTIMAL, "relaxation", 1, root.warm)
+        if stopped:
+            return SearchResult(x, value, bound, codes.LIMIT, None, 1, root.warm, reason=codes.OUT_OF_TIME)
+        return SearchResult(x, value, bound, codes.UNPROVEN, None, 1, root.warm, reason=ROUNDED)
 
     @functools.cached_property
     def _unit(self) -> float:
@@ -232,7 +242,10 @@ class Planner:
     ) -> Plan:
         if result.x is None:
             name, took = codes.STATUS[result.status], clock.seconds
-            return Plan(name, None, None, None, None, None, None, None, None, result.nodes, took, None)
+            nothing: Any = (None,) * 8
+            return Plan(
+                name, *nothing, nodes=result.nodes, solve_time_s=took, finished_by=None, reason=result.reason
+            )
         core, size = self.controllers.cores.shared, self.controllers.size
         x = np.array(result.x)
         x = np.where(np.asarray(core.qp.whole), np.round(x), x)
@@ -240,9 +253,9 @@ class Planner:
         moves = (x * np.asarray(core.qp.scale)).reshape(size.mvs, -1).T[: self.structure.block_count]
         objective, cv, eps = self.objective(moves, free_response, setpoint)
         bound = min(result.bound, objective)
-        state = result.status
+        state, reason = result.status, result.reason
         if state == codes.OPTIMAL and not closes(objective, bound, self._unit, gap):
-            state = codes.LIMIT
+            state, reason = codes.UNPROVEN, ROUNDED
         return Plan(
             status=codes.STATUS[state],
             objective=objective,
@@ -256,6 +269,7 @@ class Planner:
             nodes=result.nodes,
             solve_time_s=clock.seconds,
             finished_by=result.finished_by if state == codes.OPTIMAL else None,
+            reason=reason,
             warm=result.root,
         )
 

@@ -99,7 +99,10 @@ def branch_and_bound(
         if least >= search.cutoff:
             search.discard(least)
             return np.inf
-        if search.out_of_time() or tree.held > HELD:
+        if tree.held > HELD:
+            search.reason = "the open nodes of branch and bound take the memory that they may, a gigabyte"
+            return least
+        if search.out_of_time():
             return least
         yield from tree.step()
 

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from jaxmpc.errors import InputError
 from jaxmpc.integer.feasible import UndecidedError, chains_of, nearest, whole
-from jaxmpc.integer.host_search import Known, SearchResult
+from jaxmpc.integer.host_search import NOT_CLOSED, Known, SearchResult
 from jaxmpc.integer.relaxer import Relaxations, Relaxer
 from jaxmpc.integer.solve import solve_integers
 from jaxmpc.integer.tables import Constants
@@ -25,7 +25,7 @@ from jaxmpc.problem.memory import check_ranges
 from jaxmpc.programs.clock import Clock
 from jaxmpc.relaxed.gap import closes
 from jaxmpc.relaxed.newton import MOST_STEPS
-from jaxmpc.status import LIMIT, OPTIMAL
+from jaxmpc.status import LIMIT, OPTIMAL, UNPROVEN
 
 WIDEST_ENVELOPE = 4  # steps up to which the envelope of the squared integer move is built
 
@@ -91,7 +91,7 @@ def finish_steps(
     )
     for i, result in enumerate(found):
         left = None if time_limit is None else time_limit - result.seconds
-        if result.status == LIMIT and (left is None or left > 0):
+        if result.status in (LIMIT, UNPROVEN) and (left is None or left > 0):
             weight = relaxer.scenario(i).chords_within(left)
             if weight is not None and weight.any():
                 found[i] = _tightened(relaxer, instances, i, result, starts[i], rest)
@@ -123,7 +123,10 @@ def _tightened(
     closed = closes(result.value, result.bound, own.scenario(0).scale, rest["gap"])
     if result.x is not None and closed != (result.status == OPTIMAL):
         by = result.finished_by or "branch-and-bound"
-        result.status, result.finished_by = (OPTIMAL, by) if closed else (LIMIT, None)
+        if closed:
+            result.status, result.finished_by, result.reason = OPTIMAL, by, None
+        else:
+            result.status, result.finished_by, result.reason = UNPROVEN, None, NOT_CLOSED
     return result
 
 

@@ -31,8 +31,10 @@ from jaxmpc.problem.instance import QpInstance
 from jaxmpc.programs.clock import Clock
 from jaxmpc.relaxed.gap import FINEST, closes, cutoff, reference
 from jaxmpc.relaxed.newton import WarmStart
-from jaxmpc.status import FAILED, INFEASIBLE, LIMIT, OPTIMAL
+from jaxmpc.status import FAILED, INFEASIBLE, LIMIT, OPTIMAL, OUT_OF_TIME, UNPROVEN
 
+NO_MOVES = "no moves satisfy the hard limits: positions, moves per sample, oscillation rows, mean-move limit"
+NOT_CLOSED = "rounding leaves a gap that branching does not close"
 NEARLY = 1e-12  # of a curvature, added where it may be singular
 GROUP = 8  # problems a search asks for at once: as many as one small batch holds
 
@@ -66,7 +68,10 @@ Steps = Generator[Request | Offload, Any, Any]  # a search, or a part of one
 
 @dataclasses.dataclass
 class SearchResult:
-    """Outcome of an integer solve: scaled moves, value, bound, status code, who finished, nodes, root prices, seconds."""
+    """Outcome of an integer solve: scaled moves, value, bound, status code, who finished, nodes, root prices, seconds.
+
+    `reason` is a sentence that says why it is not optimal, None where it is.
+    """
 
     x: np.ndarray | None
     value: float
@@ -76,6 +81,12 @@ class SearchResult:
     nodes: int
     root: WarmStart | None = None
     seconds: float = 0.0
+    reason: str | None = None
+
+
+def no_whole_moves(by: str | None = None, nodes: int = 0) -> SearchResult:
+    """Of a problem whose hard limits no whole moves satisfy."""
+    return SearchResult(None, np.inf, np.inf, INFEASIBLE, by, nodes, reason=NO_MOVES)
 
 
 class Known(NamedTuple):
@@ -116,6 +127,8 @@ class Search:
         self.value, self.x = np.inf, None
         self.left_out = np.inf  # least bound of everything that was discarded
         self.still_open = -np.inf  # least bound of what is open, as far as it is known
+        self.stopped = False  # whether the time limit has ended it
+        self.reason = NOT_CLOSED  # why it ends if that is without a proof and before its time
         self.nodes = 1
         self.seen: set[bytes] = set()
         self.spent = 0.0  # seconds of work so far, kept by the scheduler,
@@ -134,7 +147,8 @@ class Search:
 
     def out_of_time(self) -> bool:
         """Whether the time limit is used up."""
-        return self.time_limit is not None and self._used() >= self.time_limit
+        self.stopped = self.stopped or (self.time_limit is not None and self._used() >= self.time_limit)
+        return self.stopped
 
     def check_time(self) -> None:
         """Called inside whatever may take longer than a millisecond.
@@ -202,6 +216,7 @@ class Search:
         else:
             stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *starts)
         result = yield Request(limits, stacked, evaluated)
+        self.stopped = self.stopped or result is None or len(result.bound) < count
         if result is None:
             raise OutOfTimeError
         if len(result.bound) < count:
@@ -299,8 +314,11 @@ class Search:
         """Assemble the result; `bound` is the least bound of what is still open."""
         bound = min(max(min(self.left_out, bound), self.root_bound), self.value)
         if self.x is None:
-            status = INFEASIBLE if by is not None else FAILED
-            return SearchResult(None, np.inf, np.inf if by else bound, status, by, self.nodes)
-        closed = closes(self.value, bound, self.constants.scale, self.gap)
-        status, by = (OPTIMAL, by) if closed else (LIMIT, None)
-        return SearchResult(self.x, self.value, bound, status, by, self.nodes, self.start)
+            if by is not None:
+                return no_whole_moves(by, self.nodes)
+            status, reason = (LIMIT, OUT_OF_TIME) if self.stopped else (FAILED, self.reason)
+            return SearchResult(None, np.inf, bound, status, None, self.nodes, reason=reason)
+        if closes(self.value, bound, self.constants.scale, self.gap):
+            return SearchResult(self.x, self.value, bound, OPTIMAL, by, self.nodes, self.start)
+        status, reason = (LIMIT, OUT_OF_TIME) if self.stopped else (UNPROVEN, self.reason)
+        return SearchResult(self.x, self.value, bound, status, None, self.nodes, self.start, reason=reason)

@@ -20,7 +20,16 @@ from jaxmpc.integer.branch_and_bound import branch_and_bound
 from jaxmpc.integer.cuts import Cuts
 from jaxmpc.integer.enumeration import enumerate_all
 from jaxmpc.integer.feasible import MoveLimits, UndecidedError, position_limits, propagate, satisfied, whole
-from jaxmpc.integer.host_search import GROUP, Known, OutOfTimeError, Search, SearchResult, Steps
+from jaxmpc.integer.host_search import (
+    GROUP,
+    NOT_CLOSED,
+    Known,
+    OutOfTimeError,
+    Search,
+    SearchResult,
+    Steps,
+    no_whole_moves,
+)
 from jaxmpc.integer.lower_bound import LowerModel, enumerate_below, exclude
 from jaxmpc.integer.outer_approximation import outer_approximation
 from jaxmpc.integer.relaxer import Relaxations, Relaxer
@@ -30,7 +39,7 @@ from jaxmpc.problem.instance import QpInstance
 from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure
 from jaxmpc.relaxed.gap import closes
-from jaxmpc.status import INFEASIBLE, OPTIMAL
+from jaxmpc.status import OPTIMAL
 
 BEAM = 64  # partial candidates kept while looking for good first moves
 FINISHES = ("auto", "enumeration", "highs", "branch-and-bound")
@@ -119,8 +128,9 @@ def _stages(search: Search, starts: Sequence[np.ndarray], finish: str, last: boo
     c, root, root_bound = search.constants, search.root, search.root_bound
     integer = c.integer
     low, high = whole(search.limits[0][integer]), whole(search.limits[1][integer])
-    infeasible = SearchResult(None, np.inf, np.inf, INFEASIBLE, None, 0)
+    infeasible = no_whole_moves()
     if not (np.isfinite(root.x).all() and np.isfinite(root.bound).all()):
+        search.reason = "the relaxation was not solved: its numbers are not finite"
         return search.finish(None, root_bound)
     model, lower, upper = search.lower_model(root, 0, low, high), low, high
     own = MoveLimits(low, high, *position_limits(search.chains))
@@ -131,6 +141,7 @@ def _stages(search: Search, starts: Sequence[np.ndarray], finish: str, last: boo
         try:
             point = _repaired(search, model, lower, upper) if possible else None
         except UndecidedError:
+            search.reason = "whether any whole moves satisfy the hard limits would take too long to find out"
             return search.finish(None, root_bound)
         if point is None:
             return infeasible
@@ -163,8 +174,10 @@ def _stages(search: Search, starts: Sequence[np.ndarray], finish: str, last: boo
         if not done and not search.out_of_time():  # better incumbents make the list shorter
             yield from _solve_all(search, cuts, _candidates(search, model, starts, lower, upper))
             done = yield from enumerate_all(search, model, cuts, lower, upper, limited=limited)
+        search.reason = "the list of whole moves that may be better is longer than what is kept in memory"
         if done or finish == "enumeration" or search.out_of_time():
             return search.finish("enumeration" if done else None, np.inf if done else root_bound)
+    search.reason = NOT_CLOSED
     if not last and search.may_tighten():
         return search.finish(None, root_bound)
     if finish == "highs":
