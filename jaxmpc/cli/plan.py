@@ -30,9 +30,11 @@ def plan(options: Options) -> int:
 
     case = load_case(options.case)
     from jaxmpc.controller.plan import solve_plan
+    from jaxmpc.programs.progress import shown
 
     given = {field.name: getattr(case, field.name) for field in dataclasses.fields(case)}
-    body = plan_to_dict(solve_plan(**given, finish=options.finish))
+    with shown():
+        body = plan_to_dict(solve_plan(**given, finish=options.finish))
     fields = (f" {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in body.items())
     text = "{\n" + ",\n".join(fields) + "\n}\n"  # one field per line
     status, objective = body["status"], body["objective"]

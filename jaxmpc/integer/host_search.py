@@ -29,7 +29,8 @@ from jaxmpc.integer.relaxer import LaneLimits, Relaxations
 from jaxmpc.integer.tables import Constants
 from jaxmpc.problem.instance import QpInstance
 from jaxmpc.programs.clock import Clock
-from jaxmpc.relaxed.gap import FINEST, closes, cutoff, reference
+from jaxmpc.programs.progress import Seen
+from jaxmpc.relaxed.gap import FINEST, closes, cutoff, reference, relative_gap
 from jaxmpc.relaxed.newton import WarmStart
 from jaxmpc.status import FAILED, INFEASIBLE, LIMIT, OPTIMAL, OUT_OF_TIME, UNPROVEN
 
@@ -165,6 +166,12 @@ class Search:
     def seconds_left(self) -> float | None:
         """Seconds to the time limit, None without one."""
         return None if self.time_limit is None else max(self.time_limit - self._used(), 0.0)
+
+    def seen_after(self, seconds: float) -> Seen:
+        """What is known of it now, for whoever waits."""
+        value, bound = self.value, min(max(min(self.left_out, self.still_open), self.root_bound), self.value)
+        gap = float(relative_gap(value, bound, self.constants.scale)) if np.isfinite(value) else np.nan
+        return Seen(seconds, value, bound, gap)
 
     def take(self, known: Known) -> None:
         """Start from what others have found."""

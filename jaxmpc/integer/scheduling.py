@@ -7,6 +7,7 @@ few compiled calls; a scenario that is done drops out and costs nothing more.
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import os
 
 import jax
@@ -17,6 +18,7 @@ from jaxmpc.integer.relaxer import LANES, Relaxations, Relaxer
 from jaxmpc.problem.instance import QpInstance
 from jaxmpc.programs.clock import Clock
 from jaxmpc.programs.interrupts import being_left
+from jaxmpc.programs.progress import Seen, watched
 from jaxmpc.relaxed.newton import MOST_STEPS
 from jaxmpc.status import OPTIMAL
 
@@ -55,6 +57,20 @@ def run(
         Their results, in the same order.
     """
     runs = [_Run(*entry) for entry in searches]
+    if any(search.time_limit is not None for _, search, _ in searches):
+        return _run(relaxer, instances, runs)
+    before = [search.spent for _, search, _ in searches]
+
+    def seen(seconds: float) -> Seen:
+        k = next((k for k, one in enumerate(runs) if one.result is None), len(runs) - 1)
+        return runs[k].search.seen_after(before[k] + seconds)
+
+    with watched(seen) if runs else contextlib.nullcontext():
+        return _run(relaxer, instances, runs)
+
+
+def _run(relaxer: Relaxer, instances: QpInstance, runs: list[_Run]) -> list[SearchResult]:
+    """Run searches to their ends."""
     for one in runs:
         one.send(None)
     pool = None

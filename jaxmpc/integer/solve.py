@@ -31,7 +31,7 @@ from jaxmpc.integer.host_search import (
     no_whole_moves,
 )
 from jaxmpc.integer.lower_bound import LowerModel, enumerate_below, exclude
-from jaxmpc.integer.outer_approximation import outer_approximation
+from jaxmpc.integer.outer_approximation import ContradictionError, outer_approximation
 from jaxmpc.integer.relaxer import Relaxations, Relaxer
 from jaxmpc.integer.scheduling import run
 from jaxmpc.problem.blocking import moves_per_block
@@ -182,8 +182,11 @@ def _stages(search: Search, starts: Sequence[np.ndarray], finish: str, last: boo
         return search.finish(None, root_bound)
     if finish == "highs":
         seconds = search.seconds_left()
-        done, bound = yield from outer_approximation(search, model, cuts, lower, upper, seconds)
-        return search.finish("highs" if done else None, max(root_bound, min(bound, search.value)))
+        with contextlib.suppress(ContradictionError):
+            done, bound = yield from outer_approximation(search, model, cuts, lower, upper, seconds)
+            search.reason = "HiGHS has ended without a proof"
+            return search.finish("highs" if done else None, max(root_bound, min(bound, search.value)))
+        search.still_open = -np.inf  # nothing that HiGHS has said is believed any more
     bound = yield from branch_and_bound(search, root, model, cuts, lower, upper, root_bound)
     return search.finish("branch-and-bound", bound)
 
