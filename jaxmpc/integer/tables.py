@@ -93,7 +93,7 @@ class Constants:
             ) from None
         self.slope = np.asarray(qp.steep)[:, self.integer]  # of the envelope
         self.knot = np.arange(len(self.slope), dtype=float)[:, None]
-        self.scale = max(float(np.diag(curvature).max()), 1e-12)
+        self.scale = float(qp.unit)
         self.own_weight = 0.5 * (np.diag(curvature) - np.diag(hessian))[self.integer]
         # hard rows of the positions of the integer MVs, and these positions as sums of the whole moves
         self.position = np.concatenate(

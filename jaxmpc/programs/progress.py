@@ -1,7 +1,7 @@
 """A long step is seen: what is known of it, on standard error, every two seconds from the second on.
 
-`jaxmpc plan` and `jaxmpc simulate` enter `shown`; the searches on the host say with `watched` what there is to be seen. A step
-that ends earlier says nothing, nor does one with a time limit, whose end is known. Quiet where compilation is.
+`jaxmpc plan` and `jaxmpc simulate` enter `shown`; the searches on the host say with `watched` what there is to be seen. A
+step that ends earlier says nothing, nor does one with a time limit, whose end is known. Quiet where compilation is.
 """
 
 from __future__ import annotations
