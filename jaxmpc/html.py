@@ -33,6 +33,8 @@ def number(value: Any) -> str:
     """One number, flag or array for a table: six digits; a dash for None, a shape where there is no value to show."""
     if value is None:
         return "–"
+    if isinstance(value, tuple) and any(isinstance(part, tuple) for part in value):
+        return "; ".join(map(number, value))
     try:
         array = np.asarray(value)
     except Exception:  # a traced value has no numbers
@@ -186,7 +188,9 @@ def plan(solved: Any) -> str:
         for m in range(mv.shape[1]):
             drawn = chart(f"planned MV {m + 1}", [Curve(mv[:, m], held=True)])
             listed = " ".join(number(v) for v in moves[:8, m]) + (" …" if len(moves) > 8 else "")
-            rows.append([f"MV {m + 1}", drawn, f"to {number(mv[-1, m])}", f"block moves {listed}"])
+            whole = 0 if solved.integer_until is None else int(solved.integer_until[m])
+            relaxed = f", whole in the first {whole} of {len(mv)} samples only" if 0 < whole < len(mv) else ""
+            rows.append([f"MV {m + 1}", drawn, f"to {number(mv[-1, m])}", f"block moves {listed}{relaxed}"])
         for c in range(cv.shape[1]):
             drawn = chart(f"predicted CV {c + 1}", [Curve(cv[:, c])])
             rows.append([f"CV {c + 1}", drawn, f"to {number(cv[-1, c])}", ""])

@@ -368,14 +368,14 @@ def gainless_mv(case, rng):
 @twist
 def impossible_start(case, rng):
     """Previous moves outside every limit and between steps."""
-    blocks, mvs = len(case["structure"]["blocks"]), len(case["mv_now"])
+    blocks, mvs = max(map(len, oracles.read(case).lists)), len(case["mv_now"])
     units = np.array([_unit(case, m) for m in range(mvs)])
     case["previous_moves"] = (units * rng.normal(0, 4, (blocks, mvs))).tolist()
 
 
 @twist
 def plausible_start(case, rng):
-    blocks, mvs = len(case["structure"]["blocks"]), len(case["mv_now"])
+    blocks, mvs = max(map(len, oracles.read(case).lists)), len(case["mv_now"])
     units = np.array([_unit(case, m) for m in range(mvs)])
     case["previous_moves"] = (units * rng.integers(-1, 2, (blocks, mvs))).tolist()
 

@@ -57,13 +57,15 @@ def blockings(data: xr.Dataset) -> list[Blocking]:
     for one, rows in rows_by(*(found[key].tolist() for key in keys)).items():
         given = dict(zip(keys, one, strict=True))
         full: dict[str, Any] = {key: given.get(key) or setting(data, key) or thesis[key] for key in STRUCTURE}
-        lengths = [int(v) for v in as_text(full["blocks"] if full["blocks"] is not None else "").split()]
-        blocks, horizon = len(lengths), int(full["prediction_horizon"])
+        written = as_text(full["blocks"] if full["blocks"] is not None else "").split(";")
+        lengths, mvs = [[int(v) for v in own.split()] for own in written], data.sizes.get("mv", 2)
+        blocks, horizon = max(map(len, lengths)), int(full["prediction_horizon"])
+        unknowns = sum(map(len, lengths)) * (mvs if len(lengths) == 1 else 1)
         if full["blocking"] == "none":
-            blocks = int(full["control_horizon"] or 0) or sum(lengths)
+            blocks = int(full["control_horizon"] or 0) or sum(lengths[0])
+            unknowns = blocks * mvs
         same = all(as_text(full[key]) == as_text(thesis[key]) for key in ("blocking", "blocks"))
         same = same and horizon == thesis["prediction_horizon"]
-        unknowns = blocks * data.sizes.get("mv", 2)
         out.append(Blocking(str(full["blocking"]), blocks, horizon, unknowns, rows, same))
     return out
 

@@ -1,4 +1,5 @@
-"""Times of controller steps: thesis figure 39 (chapter 8), and the same and rates over batch sizes from a benchmark.
+"""Times of controller steps: thesis figure 39 (chapter 8), and what a benchmark measured: the same, rates over batch sizes,
+and performance profiles of solvers.
 
 `draw_benchmark` reads the JSON file of `jaxmpc bench --json`, or the same content in memory; nothing is measured here.
 """
@@ -17,10 +18,12 @@ from matplotlib.figure import Figure
 from figures import style
 from figures.figure import FigureEntry
 from jaxmpc.errors import InputError
+from studies.bench.judge import performance_profile
 
 MILLISECONDS = 1e3  # of a second
 TIMED = ("step-choke", "mixed-integer")
 RUN_NAME, BATCH_NAME = "figure_39_time_per_sample", "bench_rate_over_batch"
+PROFILE_NAME = "bench_performance_profile"
 DT_HOURS = 10.0 / 3600.0  # sampling interval of the thesis preset [h]
 MODES = ("moves", "inputs")
 
@@ -81,6 +84,8 @@ def draw_benchmark(results: str | Path | dict[str, Any], out: str | Path) -> lis
         paths += style.save(time_per_sample(runs), out, RUN_NAME)
     if any(name.startswith("batch ") for name in series):
         paths += style.save(rate_over_batch(series), out, BATCH_NAME)
+    if "foreign" in series:
+        paths += style.save(profiles(series["foreign"]), out, PROFILE_NAME)
     return paths
 
 
@@ -129,6 +134,29 @@ def rate_over_batch(series: dict[str, Any]) -> Figure:
         ax.set_title(f"relaxed QP, {mode}", loc="left")
     axes[0].legend(loc="best")
     axes[-1].set_xlabel("batch size [problems]")
+    return drawn
+
+
+def profiles(seconds: dict[str, Any]) -> Figure:
+    """Share of instances that each solver solves within a factor of the fastest; times ``"instance"`` by solver [s]."""
+    drawn, (ax,) = style.figure(1, width=6.0, row_height=3.2)
+    looks = zip(
+        (style.GREEN, style.BLUE, style.VERMILLION, *style.SPARE_COLOURS),
+        ("-", "--", "-.", ":", "-"),
+        strict=False,
+    )
+    curves = performance_profile(seconds)
+    widest = 2.0 * max(float(factors.max(initial=1.0)) for factors, _ in curves.values())
+    for (name, (factors, shares)), (colour, line) in zip(curves.items(), looks, strict=False):
+        steps = np.r_[1.0, factors, widest], 100.0 * np.r_[0.0, shares, shares[-1:] if len(shares) else 0.0]
+        ax.step(*steps, line, where="post", color=colour, label=name)
+    ax.set_xscale("log")
+    ax.set_xlim(1.0, widest)
+    ax.set_ylim(0.0, 102.0)
+    ax.set_xlabel("factor to the fastest solver of an instance")
+    ax.set_ylabel("solved within the factor [% of instances]")
+    ax.set_title(f"{len(next(iter(seconds.values())))} instances", loc="left")
+    ax.legend(loc="best")
     return drawn
 
 

@@ -98,7 +98,7 @@ class Scenarios:
         number = counts.pop() if counts else 1
         one_each = lambda values: list(values) * number if len(values) == 1 else list(values)  # noqa: E731
         pairs = {(s, m.samples) for s in set(structures) for m in models}
-        most = max(len(s.integer_mvs) * s.block_count for s in structures)
+        most = max(sum(map(s.whole_blocks, s.integer_mvs)) for s in structures)
         return cls(
             *map(one_each, (structures, tunings, models)),
             own=_Own(*(len(values) > 1 for values in (structures, tunings, models))),

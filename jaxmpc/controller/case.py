@@ -65,8 +65,9 @@ class _StructureFields(msgspec.Struct, forbid_unknown_fields=True):
     control_horizon: int
     first_penalised: int
     blocking: str
-    blocks: list[int] = []
+    blocks: Any = []  # lengths, or an object of them by MV
     integer_step: dict[str, Any] = {}
+    integer_horizon: int | dict[str, Any] = {}
 
 
 _IN_STEP = {key: field for key, field in TUNING.items() if field.in_step}
@@ -107,6 +108,7 @@ _ARRAYS = {  # unit, names of the columns, number of rows and what that is
     "setpoint": ("CV unit", "cv_names", "prediction_horizon", "prediction_horizon"),
     "previous_moves": ("MV unit per sample", "mv_names", "block_count", "the number of blocks"),
 }
+_PLAIN_STRUCTURE = ("prediction_horizon", "control_horizon", "first_penalised", "blocking")
 _PLAN = (
     *("status", "objective", "bound", "gap", "moves", "mv", "cv", "eps_high", "eps_low"),
     *("nodes", "solve_time_s", "finished_by"),
@@ -155,8 +157,7 @@ def make_case(body: Any) -> Case:
         InputError: naming the path of the field, for unknown or missing fields, wrong types (true and false
             are not numbers), wrong shapes, NaN, crossed limits, and whatever else makes the step meaningless.
     """
-    told = lambda path, words: words + _unit(path)  # noqa: E731
-    fields = decode(body, _CaseFields, name="case", table="an object {...}", expected=told)
+    fields = decode(body, _CaseFields, name="case", table="an object {...}", expected=_told)
     model = make_model(fields.model.coefficients, fields.model.dt, fields.model.cv, fields.model.mv)
     structure = _structure(fields.structure, model)
     limits = fields.limits or _LimitFields()
@@ -179,6 +180,8 @@ def case_to_dict(case: Case) -> dict[str, Any]:
     logs a step passes the move limits that held in that step.
     """
     structure, model = case.structure, case.model
+    named = zip(structure.mv_names, structure.integer_horizon, strict=True)
+    horizons = {name: horizon for name, horizon in named if horizon is not None}
     tuning = {key: np.asarray(getattr(case.tuning, key)).tolist() for key in _IN_STEP}
     for key, field in _IN_STEP.items():
         if field.flag:
@@ -191,9 +194,10 @@ def case_to_dict(case: Case) -> dict[str, Any]:
             "coefficients": np.asarray(model.coefficients).tolist(),
         },
         "structure": {
-            **{key: getattr(structure, key) for key in _StructureFields.__struct_fields__},
-            "blocks": list(structure.blocks),
+            **{key: getattr(structure, key) for key in _PLAIN_STRUCTURE},
+            "blocks": _blocks(structure),
             "integer_step": {structure.mv_names[i]: structure.integer_step[i] for i in structure.integer_mvs},
+            **({"integer_horizon": horizons} if horizons else {}),
         },
         "tuning": _plain(tuning),
         **{key: np.asarray(getattr(case, key)).tolist() for key in _ARRAYS if getattr(case, key) is not None},
@@ -210,11 +214,11 @@ def dump_case(case: Case, path: str | Path) -> Path:
 def plan_to_dict(plan: Any) -> dict[str, Any]:
     """The content of a plan file: the fields of a `Plan`, with null where a number is not finite.
 
-    The reason is there only where the plan is not optimal.
+    The reason is there only where the plan is not optimal, `integer_until` where an integer horizon leaves moves relaxed.
     """
-    reason = getattr(plan, "reason", None)
+    some = {name: _plain(getattr(plan, name, None)) for name in ("reason", "integer_until")}
     body = {name: _plain(getattr(plan, name)) for name in _PLAN}
-    return body if reason is None else body | {"reason": reason}
+    return body | {name: value for name, value in some.items() if value is not None}
 
 
 def _plain(value: Any) -> Any:
@@ -244,6 +248,51 @@ def _unit(path: str) -> str:
     return f" [{_UNIT[path]}]" if _UNIT.get(path) else ""
 
 
+def _told(path: str, words: str) -> str:
+    return words + _unit(path)
+
+
+def _blocks(structure: Structure) -> Any:
+    """The blocks as a case file has them."""
+    if not structure.own_blocks:
+        return list(structure.blocks)
+    return {name: list(structure.blocks_of(mv)) for mv, name in enumerate(structure.mv_names)}
+
+
+def _given_blocks(given: Any, names: tuple[str, ...]) -> tuple[Any, ...]:
+    """The blocks of a case file: a list for all MVs, or one per MV."""
+    if not isinstance(given, dict):
+        return tuple(decode(given, list[int], "structure.blocks", expected=_told))
+    listed, unit = ", ".join(names), _unit("structure.blocks")
+    for name, lengths in given.items():
+        if name not in names:
+            raise InputError(f"structure.blocks.{name}", lengths, f"one of the MV names {listed}")
+    for name in names:
+        if name not in given:
+            raise InputError(
+                f"structure.blocks.{name}",
+                "nothing",
+                f"lengths of its blocks{unit}: each of {listed} needs its own",
+            )
+    expected = lambda _, words: words + unit  # noqa: E731
+    lists = (decode(given[name], list[int], f"structure.blocks.{name}", expected=expected) for name in names)
+    return tuple(map(tuple, lists))
+
+
+def _given_horizon(given: int | dict[str, Any], integer: dict[str, Any], names: tuple[str, ...]) -> tuple:
+    """The integer horizon of a case file: one for all MVs, or those of some."""
+    if not isinstance(given, dict):
+        return (given,) * len(names)
+    for name, horizon in given.items():
+        if name not in integer:
+            expected = f"one of the MVs with an integer_step ({', '.join(integer) or 'there is none'})"
+            raise InputError(f"structure.integer_horizon.{name}", horizon, expected)
+        if horizon is None:
+            expected = "a whole number of samples, 1 or more; leave an MV out whose moves are all whole"
+            raise InputError(f"structure.integer_horizon.{name}", horizon, expected)
+    return tuple(given.get(name) for name in names)
+
+
 def _structure(fields: _StructureFields, model: StepResponseModel) -> Structure:
     steps: list[Any] = [None] * len(model.mv_names)
     for name, step in fields.integer_step.items():
@@ -263,9 +312,10 @@ def _structure(fields: _StructureFields, model: StepResponseModel) -> Structure:
         prediction_horizon=fields.prediction_horizon,
         control_horizon=fields.control_horizon,
         first_penalised=fields.first_penalised,
-        blocks=tuple(fields.blocks),
+        blocks=_given_blocks(fields.blocks, model.mv_names),
         blocking=fields.blocking,  # type: ignore[arg-type]  # `Structure` checks it
         integer_step=tuple(steps),
+        integer_horizon=_given_horizon(fields.integer_horizon, fields.integer_step, model.mv_names),
     )
 
 

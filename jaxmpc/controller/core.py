@@ -305,7 +305,7 @@ class Core(eqx.Module):
             position=state.position + move,
             last_move=move,
             past_moves=jnp.concatenate([state.past_moves[1:], move[None]]),
-            plan=self.layout.shift @ moves,
+            plan=self.layout.shifted(moves),
             warm=shifted_start(warm, self.size.cvs),
         )
 
@@ -315,7 +315,7 @@ class Core(eqx.Module):
 
     def first_move(self, scale, instance: QpInstance, move: Float[Array, " mv"]) -> Float[Array, " mv"]:
         """The move to apply [MV unit]: solver tolerance must not leave what the limits allow the first block."""
-        mv, held = np.arange(self.size.mvs), self.layout.count[0]
+        mv, held = np.arange(self.size.mvs), self.layout.count[..., 0]
         first, row = mv * self.size.blocks, mv * self.size.rows
         low = jnp.maximum(instance.lower[first], instance.row_low[row] / held)
         high = jnp.minimum(instance.upper[first], instance.row_high[row] / held)

@@ -12,7 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from jaxmpc import html
@@ -28,7 +28,7 @@ from jaxmpc.integer.relaxer import Relaxations
 from jaxmpc.integer.search import Decision, Relaxed, decide
 from jaxmpc.integer.solve import continuous_feasible
 from jaxmpc.model.step_response import StepResponseModel
-from jaxmpc.problem.blocking import moves_per_block, sample_moves
+from jaxmpc.problem.blocking import counts_by_mv, moves_of_samples
 from jaxmpc.problem.condense import dynamic_matrix
 from jaxmpc.problem.instance import QpInstance, make_instance
 from jaxmpc.problem.structure import Structure
@@ -53,7 +53,8 @@ class Plan:
         objective: (6.6) with all constants; None without a plan.
         bound: proven lower bound of the objective.
         gap: relative gap between the two.
-        moves: per-sample move of each block (`moves`) or the move at its first sample (`inputs`).
+        moves: per-sample move of each block (`moves`) or the move at its first sample (`inputs`); zero beyond the last
+            block of an MV with blocks of its own.
         mv: MVs of the Hu samples, row 0 after the move applied now.
         cv: predicted CVs at j = 1..Hp.
         eps_high, eps_low: largest violation of each CV limit over the penalised samples.
@@ -62,6 +63,8 @@ class Plan:
         finished_by: which path closed the problem, None if none did.
         reason: a sentence that says why the plan is not optimal, None where it is.
         warm: prices of the root relaxation, a start for the next sample.
+        integer_until: under an integer horizon, the samples from the first on in which the moves of each MV are whole (0 for
+            a continuous one): later moves are relaxed, and so are objective and bound. None where no MV has relaxed ones.
     """
 
     status: str
@@ -78,6 +81,7 @@ class Plan:
     finished_by: str | None
     reason: str | None = None
     warm: WarmStart | None = None
+    integer_until: Int[np.ndarray, " mv"] | None = None
 
     def _repr_html_(self) -> str:
         """For notebooks."""
@@ -123,6 +127,7 @@ class Planner:
         cold = jax.eval_shape(core.init, np.zeros(size.cvs), np.zeros(size.mvs)).warm
         self._cold = jax.tree.map(lambda v: np.zeros((1, *v.shape)), cold)
         self._pose = PackedCall(_posed)
+        self._integer_until = np.array(structure.integer_until) if structure.relaxed_moves else None
 
     def solve(
         self,
@@ -243,9 +248,10 @@ class Planner:
         if result.x is None:
             name, took = codes.STATUS[result.status], clock.seconds
             nothing: Any = (None,) * 8
-            return Plan(
+            none = Plan(
                 name, *nothing, nodes=result.nodes, solve_time_s=took, finished_by=None, reason=result.reason
             )
+            return dataclasses.replace(none, integer_until=self._integer_until)
         core, size = self.controllers.cores.shared, self.controllers.size
         x = np.array(result.x)
         x = np.where(np.asarray(core.qp.whole), np.round(x), x)
@@ -262,7 +268,7 @@ class Planner:
             bound=bound,
             gap=float(relative_gap(objective, bound, self._unit)),
             moves=moves,
-            mv=mv_now + np.cumsum(sample_moves(self.structure) @ moves, axis=0),
+            mv=mv_now + np.cumsum(moves_of_samples(self.structure, moves), axis=0),
             cv=cv,
             eps_high=eps[0],
             eps_low=eps[1],
@@ -271,6 +277,7 @@ class Planner:
             finished_by=result.finished_by if state == codes.OPTIMAL else None,
             reason=reason,
             warm=result.root,
+            integer_until=self._integer_until,
         )
 
     def objective(
@@ -288,7 +295,7 @@ class Planner:
         beyond = np.maximum(np.abs(deviation) - tuning.deadzone, 0.0)
         eps_high = np.maximum((y - tuning.cv_high).max(axis=0), 0.0)
         eps_low = np.maximum((tuning.cv_low - y).max(axis=0), 0.0)
-        counts = moves_per_block(self.structure)[:, None]
+        counts = counts_by_mv(self.structure)
         value = (
             (tuning.cv_weight * deviation**2).sum()
             + (tuning.move_weight * counts * moves**2).sum()

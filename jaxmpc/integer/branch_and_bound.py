@@ -340,8 +340,7 @@ class _Tree:
         if (limits.lower < limits.upper).any():
             return bound
         if satisfied(search.chains, limits.lower[None], limits.lower, limits.upper)[0]:
-            search.seen.add(limits.lower.tobytes())
-            search.discard(float(min(bound, result.snapped[lane])))
+            search.settle(limits.lower, bound, float(result.snapped[lane]))
         return np.inf
 
     def _node(self, parent: _Node, child: _Child, kept: MoveLimits, bound: float) -> _Node | None:

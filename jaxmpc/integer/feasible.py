@@ -2,7 +2,8 @@
 
 The rows of different MVs are independent, and those of one MV form a chain: the position after a block is the
 position before it plus the block's move, and the oscillation rows couple neighbours only. Limits therefore
-propagate along the chain, and a dynamic programme over (position, last move) decides feasibility exactly.
+propagate along the chain, and a dynamic programme over (position, last move) decides feasibility exactly. Moves beyond the
+integer horizon are continuous: what they can reach the limits of their own positions from is the last limit of the chain.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ MOST = 20_000_000  # combinations of position and move that are looked at in one
 HELD = 2_000_000  # of them that are remembered
 CHECKED = 100  # of them between two looks at the clock
 UNBOUNDED = 10**12  # whole steps that stand for "no limit" in integer arithmetic
+SLACK = 1e-7  # by which limits of continuous moves may miss each other [scaled moves]
 
 
 class UndecidedError(Exception):
@@ -32,14 +34,15 @@ class UndecidedError(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class Chain:
-    """The blocks of one integer MV.
+    """The blocks of one integer MV whose moves are whole.
 
     Attributes:
         columns: positions of its moves in the integer vector.
         counts: moves per block.
         low, high: allowed position after each block, in steps from now.
         coupled: whether the move of block b and of b - 1 may differ by one step at most (first entry unused).
-        windows, window_low, window_high: rows of the predictive mean-move limit; checked, not propagated.
+        windows, window_low, window_high: rows of the predictive mean-move limit; checked, not propagated. Where continuous
+            moves are part of them, too, they are what these leave at most.
     """
 
     columns: Int[np.ndarray, " block"]
@@ -52,27 +55,62 @@ class Chain:
     window_high: np.ndarray
 
 
-def chains_of(structure: Structure, size: Size, row_low: np.ndarray, row_high: np.ndarray) -> list[Chain]:
-    """Chains of all integer MVs from the limits of the hard rows (`condense.Rows`)."""
-    blocks, windows = structure.block_count, window_rows(structure)
-    low, high = (np.reshape(values, (size.mvs, size.rows)) for values in (row_low, row_high))
-    pair, window = (
-        slice(size.blocks, size.blocks + blocks),
-        slice(2 * size.blocks, 2 * size.blocks + len(windows)),
+def chains_of(structure: Structure, size: Size, instance: QpInstance) -> list[Chain]:
+    """Chains of all integer MVs from the limits of a problem, NumPy's arrays."""
+    chains, first = [], 0
+    for mv in structure.integer_mvs:
+        chains.append(_chain(structure, size, instance, mv, first))
+        first += len(chains[-1].columns)
+    return chains
+
+
+def _chain(structure: Structure, size: Size, instance: QpInstance, mv: int, first: int) -> Chain:
+    """Of one integer MV, whose moves stand in the integer vector from place `first` on."""
+    blocks, windows = structure.whole_blocks(mv), window_rows(structure, mv)
+    low, high = (
+        np.reshape(v, (size.mvs, size.rows))[mv]
+        for v in map(np.asarray, (instance.row_low, instance.row_high))
     )
-    return [
-        Chain(
-            columns=k * blocks + np.arange(blocks),
-            counts=moves_per_block(structure),
-            low=whole(low[mv, :blocks]),
-            high=whole(high[mv, :blocks]),
-            coupled=coupled_blocks(structure) & np.isfinite(high[mv, pair]),
-            windows=windows,
-            window_low=low[mv, window],
-            window_high=high[mv, window],
+    window = slice(2 * size.blocks, 2 * size.blocks + len(windows))
+    least, most, window_low, window_high = low[:blocks], high[:blocks], low[window], high[window]
+    counts = moves_per_block(structure, mv)
+    if blocks < len(counts):
+        lower, upper = (
+            np.reshape(v, (size.mvs, -1))[mv, : len(counts)]
+            for v in map(np.asarray, (instance.lower, instance.upper))
         )
-        for k, mv in enumerate(structure.integer_mvs)
-    ]
+        tail = slice(blocks, len(counts))
+        ends = _before_tail(low[: len(counts)], high[: len(counts)], lower * counts, upper * counts, blocks)
+        least, most = np.append(least[:-1], ends[0]), np.append(most[:-1], ends[1])
+        with np.errstate(invalid="ignore"):  # no limit times no share
+            reach = [np.nansum(windows[:, tail] * own[tail], axis=1) for own in (lower, upper)]
+        windows, window_low, window_high = windows[:, :blocks], window_low - reach[1], window_high - reach[0]
+    return Chain(
+        columns=first + np.arange(blocks),
+        counts=counts[:blocks],
+        low=whole(least),
+        high=whole(most),
+        coupled=coupled_blocks(structure, mv)[:blocks]
+        & np.isfinite(high[size.blocks : size.blocks + blocks]),
+        windows=windows,
+        window_low=window_low,
+        window_high=window_high,
+    )
+
+
+def _before_tail(low, high, lower, upper, blocks: int) -> tuple[float, float]:
+    """Least and largest whole position after so many blocks from which the continuous moves after them fit their limits.
+
+    Args:
+        low, high: limits of the positions after all blocks.
+        lower, upper: of what the blocks add to them.
+    """
+    least, most = low[-1], high[-1]
+    for b in range(len(low) - 1, blocks - 1, -1):
+        if lower[b] > upper[b] + SLACK or least > most + SLACK:
+            return np.inf, -np.inf
+        least, most = max(low[b - 1], least - upper[b]), min(high[b - 1], most - lower[b])
+    return np.ceil(least - SLACK), np.floor(most + SLACK)
 
 
 def whole(steps: np.ndarray) -> Int[np.ndarray, "..."]:
@@ -335,15 +373,16 @@ def _among(chain: Chain, wanted, lower, upper, check_time) -> list[int] | None:
 def held_within(
     structure: Structure, size: Size, instance: QpInstance, x: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Moves of the continuous MVs near `x` that keep their limits: block after block, the end always within reach.
+    """Moves that need not be whole near `x` that keep their limits: block after block, the end always within reach.
 
     The others stay as they are; where the limits leave no moves at all, some are broken.
     """
     by_mv = lambda values: np.reshape(values, (size.mvs, -1))  # noqa: E731
     lower, upper = by_mv(instance.lower), by_mv(instance.upper)
     row_low, row_high = by_mv(instance.row_low), by_mv(instance.row_high)
-    x, counts = np.array(x), moves_per_block(structure)
-    for mv in sorted(set(range(size.mvs)) - set(structure.integer_mvs)):
+    x = np.array(x)
+    for mv in range(size.mvs):
+        counts, whole_blocks = moves_per_block(structure, mv), structure.whole_blocks(mv)
         # positions from which all later limits can be kept
         least, most = row_low[mv, : len(counts)].copy(), row_high[mv, : len(counts)].copy()
         for b in range(len(counts) - 2, -1, -1):
@@ -353,6 +392,6 @@ def held_within(
         for b, count in enumerate(counts):
             low = max(lower[mv, b], (least[b] - position) / count)
             high = min(upper[mv, b], (most[b] - position) / count)
-            own[b] = min(max(own[b], low), high) if low <= high else own[b]
+            own[b] = min(max(own[b], low), high) if b >= whole_blocks and low <= high else own[b]
             position += count * own[b]
     return x

@@ -163,7 +163,7 @@ def _bounded(relaxer_of, instances: QpInstance) -> tuple[np.ndarray, np.ndarray]
 
 def _whole_near(constants: Constants, instance: QpInstance, wanted: np.ndarray) -> np.ndarray:
     """Whole moves near `wanted` that satisfy the hard rows; the rounded ones where there are none within reach."""
-    chains = chains_of(constants.structure, constants.size, instance.row_low, instance.row_high)  # pyright: ignore
+    chains = chains_of(constants.structure, constants.size, instance)
     for reach in (0, 3, 30):
         low, high = whole(np.floor(wanted + 0.5)) - reach, whole(np.floor(wanted + 0.5)) + reach
         with contextlib.suppress(UndecidedError):

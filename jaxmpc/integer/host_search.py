@@ -24,6 +24,7 @@ from jaxmpc.integer.feasible import (
     satisfied,
     whole,
 )
+from jaxmpc.integer.followed import followed
 from jaxmpc.integer.lower_bound import LowerModel
 from jaxmpc.integer.relaxer import LaneLimits, Relaxations
 from jaxmpc.integer.tables import Constants
@@ -120,9 +121,9 @@ class Search:
         self.constants, self.instance, self.time_limit = constants, instance, time_limit
         self.gap = max(gap, FINEST)
         self.limits = np.asarray(instance.lower), np.asarray(instance.upper)
-        self.chains: list[Chain] = chains_of(
-            constants.structure, constants.size, np.asarray(instance.row_low), np.asarray(instance.row_high)
-        )
+        self.chains: list[Chain] = chains_of(constants.structure, constants.size, instance)
+        # whether it takes more than the chains to tell which whole moves can be followed
+        self.followed = constants.structure.relaxed_moves and constants.size.windows > 0
         self.root, self.start = root, root.start(0)
         self.root_bound = max(float(root.bound[0]), 0.0)  # every term of (6.6) is non-negative
         self.value, self.x = np.inf, None
@@ -247,10 +248,21 @@ class Search:
         result = yield from self.relax(points, points)
         known = result.bound if bounds is None else np.maximum(result.bound, bounds)
         for i, point in enumerate(points):
-            self.seen.add(point.tobytes())
             self.offer(result, i)
-            self.discard(float(min(known[i], result.snapped[i])))
+            self.settle(point, float(known[i]), float(result.snapped[i]))
         return result
+
+    def settle(self, point: np.ndarray, bound: float, value: float) -> None:
+        """Record that whole moves were solved: nothing is left of them beyond their bound and their value."""
+        self.seen.add(point.tobytes())
+        c = self.constants
+        if (
+            value == np.inf
+            and self.followed
+            and not followed(c.structure, c.size, c.qp.rows, self.instance, point)
+        ):
+            return
+        self.discard(min(bound, value))
 
     def lower_model(self, result: Relaxations, lane: int, lower: np.ndarray, upper: np.ndarray) -> LowerModel:
         """The quadratic lower bound over the whole moves that a relaxed solve within these limits proves."""

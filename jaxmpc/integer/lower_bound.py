@@ -54,7 +54,7 @@ class LowerModel:
         excess: ``"integer value"``; column v stands for the move `lower + v`, infinite beyond `upper`.
         schur: S.
         radius: diagonal of the inverse of S; bounds one move with the others free.
-        order: in which the moves are assigned one after the other, block by block.
+        order: in which the moves are assigned one after the other, those of an MV block by block.
         leading: R with R'R = S in that order, lower triangular, so that term i of |R d|^2 involves d_0..d_i only.
         positions: prices of the position rows, None to leave them out.
     """
@@ -169,14 +169,16 @@ def enumerate_below(
     sizes = np.maximum(upper - lower + 1, 0)
     if beam is None and np.prod(sizes.astype(float)) <= GRID:
         return _grid_below(model, chains, lower, upper, sizes, cutoff)
-    owners = [(k, b) for b in range(len(chains[0].columns)) for k in range(len(chains))]
+    owner = {int(column): (k, b) for k, chain in enumerate(chains) for b, column in enumerate(chain.columns)}
+    place = np.argsort(model.order)
     moves = np.zeros((1, 0), dtype=int)
     bounds = np.array([model.value])
     position = np.zeros((1, len(chains)), dtype=int)
     least = np.inf
-    for i, (k, b) in enumerate(owners):
+    for i, column in enumerate(model.order):
         check_time()
-        chain, column = chains[k], model.order[i]
+        k, b = owner[int(column)]
+        chain = chains[k]
         domain = np.arange(int(lower[column]), int(upper[column]) + 1)
         if len(bounds) * len(domain) > CELLS:
             if beam is None:
@@ -192,7 +194,7 @@ def enumerate_below(
             total += np.maximum(model.positions.excess(column, reached), 0.0)
         good = (reached >= chain.low[b]) & (reached <= chain.high[b])
         if chain.coupled[b]:
-            good &= np.abs(domain - moves[:, i - len(chains), None]) <= 1
+            good &= np.abs(domain - moves[:, place[chain.columns[b - 1]], None]) <= 1
         below = total < cutoff
         if np.isfinite(cutoff):
             out = good & ~below
@@ -209,7 +211,7 @@ def enumerate_below(
         position[:, k] = reached[parents, chosen]
         if not len(moves):
             break
-    result = np.zeros((len(moves), len(owners)), dtype=int)
+    result = np.zeros((len(moves), len(owner)), dtype=int)
     result[:, model.order[: moves.shape[1]]] = moves
     rank = np.argsort(bounds, kind="stable")
     return result[rank], bounds[rank], least
@@ -236,9 +238,9 @@ def _grid_below(model: LowerModel, chains: list[Chain], lower, upper, sizes, cut
     return points[rank], bounds[rank], least
 
 
-def assignment_order(blocks: int, chains: int) -> Int[np.ndarray, " integer"]:
-    """Integer moves block by block, the MVs of a block one after the other."""
-    return np.arange(blocks * chains).reshape(chains, blocks).T.reshape(-1)
+def assignment_order(start: np.ndarray, mv: np.ndarray) -> Int[np.ndarray, " integer"]:
+    """Integer moves by their first sample, the MVs of a sample one after the other."""
+    return np.lexsort((mv, start))
 
 
 def leading_factor(matrix: np.ndarray) -> np.ndarray:

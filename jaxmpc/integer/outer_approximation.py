@@ -76,8 +76,8 @@ def outer_approximation(
             raise ContradictionError(contradiction(bound, witness, "a known plan"))
         if point is not None:
             fits = satisfied(search.chains, point[None], lower, upper)[0]
-            value = float(tangents.values(point[None])[0])
-            if not fits or bound > value + ROUNDING * (abs(value) + unit):
+            value = float(tangents.values(point[None])[0])  # minus infinity before the first tangent
+            if not fits or (np.isfinite(value) and bound > value + ROUNDING * (abs(value) + unit)):
                 whose = "its own plan" if fits else "its own plan, which breaks hard rows,"
                 raise ContradictionError(contradiction(bound, value, whose))
         search.still_open = max(search.still_open, min(bound, search.value))
@@ -88,8 +88,9 @@ def outer_approximation(
         if point is None or not finished:
             return False, best_bound
         search.nodes += 1
-        if tangents.knows(point):
-            master.forbid(point)  # rounding of the master: its value is known, only what is left matters
+        # rounding of the master, or moves that nothing can follow: what they are worth is known, what is left matters
+        if tangents.knows(point) or (search.followed and point.tobytes() in search.seen):
+            master.forbid(point)
         points = around(search.chains, point, lower, upper)
 
 

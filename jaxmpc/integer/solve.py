@@ -19,7 +19,15 @@ import numpy as np
 from jaxmpc.integer.branch_and_bound import branch_and_bound
 from jaxmpc.integer.cuts import Cuts
 from jaxmpc.integer.enumeration import enumerate_all
-from jaxmpc.integer.feasible import MoveLimits, UndecidedError, position_limits, propagate, satisfied, whole
+from jaxmpc.integer.feasible import (
+    SLACK,
+    MoveLimits,
+    UndecidedError,
+    position_limits,
+    propagate,
+    satisfied,
+    whole,
+)
 from jaxmpc.integer.host_search import (
     GROUP,
     NOT_CLOSED,
@@ -230,17 +238,16 @@ def _candidates(
 
 def continuous_feasible(structure: Structure, size: Size, instance: QpInstance) -> bool:
     """Whether the limits of the continuous MVs leave any moves at all (exact, by reachable positions)."""
-    counts, slack = moves_per_block(structure), 1e-7
     by_mv = lambda values: np.reshape(values, (size.mvs, -1))  # noqa: E731
     lower, upper = by_mv(instance.lower), by_mv(instance.upper)
     row_low, row_high = by_mv(instance.row_low), by_mv(instance.row_high)
     for mv in sorted(set(range(size.mvs)) - set(structure.integer_mvs)):
-        if (lower[mv] > upper[mv] + slack).any():
+        if (lower[mv] > upper[mv] + SLACK).any():
             return False
         least = most = 0.0
-        for b in range(structure.block_count):
-            least = max(least + counts[b] * lower[mv, b], row_low[mv, b])
-            most = min(most + counts[b] * upper[mv, b], row_high[mv, b])
-            if least > most + slack:
+        for b, count in enumerate(moves_per_block(structure, mv)):
+            least = max(least + count * lower[mv, b], row_low[mv, b])
+            most = min(most + count * upper[mv, b], row_high[mv, b])
+            if least > most + SLACK:
                 return False
     return True

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxmpc.errors import InputError
 from jaxmpc.integer.lower_bound import assignment_order, leading_factor, root_factor, schur_complement
 from jaxmpc.integer.tighten import chord_weights
-from jaxmpc.problem.blocking import coupled_blocks, moves_per_block
+from jaxmpc.problem.blocking import block_starts, coupled_blocks, moves_per_block
 from jaxmpc.problem.condense import CondensedQp
 from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure
@@ -72,12 +72,15 @@ class Constants:
 
     def __init__(self, structure: Structure, size: Size, qp: CondensedQp):
         self.structure, self.size, self.qp = structure, size, qp
-        blocks = np.arange(structure.block_count)
-        columns = [mv * size.blocks + blocks for mv in structure.integer_mvs]
-        self.integer = np.concatenate([*columns, []]).astype(int)  # places of the integer moves in x
+        whole = [(mv, structure.whole_blocks(mv)) for mv in structure.integer_mvs]
+        # MV and block of every integer move, and their places in x
+        self.mv = np.repeat([mv for mv, _ in whole], [count for _, count in whole]).astype(int)
+        self.block = np.concatenate([*(np.arange(count) for _, count in whole), []]).astype(int)
+        self.integer = self.mv * size.blocks + self.block
         self.scales = np.asarray(qp.scale)  # MV units per unit of x
         hessian, curvature = np.asarray(qp.hessian), np.asarray(qp.curvature)
-        self.order = assignment_order(structure.block_count, len(structure.integer_mvs))
+        starts = [block_starts(structure, mv)[:count] for mv, count in whole]
+        self.order = assignment_order(np.concatenate([*starts, []]), self.mv)
         try:
             with np.errstate(over="raise", invalid="raise"):
                 _check_finite(qp)
@@ -96,11 +99,14 @@ class Constants:
         self.scale = float(qp.unit)
         self.own_weight = 0.5 * (np.diag(curvature) - np.diag(hessian))[self.integer]
         # hard rows of the positions of the integer MVs, and these positions as sums of the whole moves
-        self.position = np.concatenate(
-            [mv * size.rows + blocks for mv in structure.integer_mvs] or [blocks[:0]]
-        )
-        chain = np.tri(len(blocks)) * moves_per_block(structure)
-        self.reached = np.kron(np.eye(len(structure.integer_mvs)), chain)
+        self.position = self.mv * size.rows + self.block
+        counts = [moves_per_block(structure, mv)[:count] for mv, count in whole]
+        self.counts = np.concatenate([*counts, []]).astype(int)  # samples that carry each of them
+        self.reached = self._before(self.block[:, None] >= self.block[None, :]) * self.counts
+
+    def _before(self, related: Bool[np.ndarray, "integer integer"]) -> Float[np.ndarray, "integer integer"]:
+        """Which pairs of integer moves are of one MV and related."""
+        return (related & (self.mv[:, None] == self.mv[None, :])).astype(float)
 
     @functools.cached_property
     def chord_weight(self) -> Float[np.ndarray, " position"]:
@@ -139,13 +145,15 @@ class Constants:
     def tables(self, integers: int) -> Tables:
         """For the compiled search, with room for so many integer moves."""
         structure, size, order = self.structure, self.size, self.order
-        count, blocks, room = len(order), structure.block_count, integers - len(order)
+        count, room = len(order), integers - len(order)
         known = room >= 0 and structure.mean_move_mode != "predictive"
         if not known:
             order, count, room = order[:integers], min(count, integers), max(room, 0)
-        mv, block = np.asarray(structure.integer_mvs, dtype=int)[order // blocks], order % blocks
-        mine, counts = mv[:, None] == mv[None, :], moves_per_block(structure)
-        place = mv * size.rows + block
+        place, previous = self.position, self._before(self.block[:, None] - 1 == self.block[None, :])
+        couplings = [coupled_blocks(structure, mv) for mv in range(size.mvs)]
+        coupled = np.array(
+            [couplings[mv][block] for mv, block in zip(self.mv, self.block, strict=True)], bool
+        )
 
         def padded(values, absent: float = 0):
             widths = [(0, room if n == count else 0) for n in values.shape]
@@ -156,11 +164,11 @@ class Constants:
             count=np.asarray(count),
             known=np.asarray(known),
             column=padded(one(self.integer), size.moves),
-            position=padded(place),
-            pair=padded(size.blocks + place),
-            coupled=padded(coupled_blocks(structure)[block]),
-            reach=padded((mine & (block[None, :] <= block[:, None])) * counts[block][None, :].astype(float)),
-            previous=padded((mine & (block[None, :] == block[:, None] - 1)).astype(float)),
+            position=padded(one(place)),
+            pair=padded(size.blocks + one(place)),
+            coupled=padded(one(coupled)),
+            reach=padded(self.reached[np.ix_(order, order)]),
+            previous=padded(previous[np.ix_(order, order)]),
             radius=padded(one(self.radius), np.inf),
             leading=padded(self.leading[:count, :count]),
             root=padded(one(self.root_factor)[:, :count]),

@@ -85,7 +85,7 @@ def simulate_compiled(
     ]
     with compiling_for(f"loops of {controllers.size}"):
         starts = [run.start() for run in runs]
-        runs[0].stride(starts[0], 0)
+        runs[0].stride(starts[0], 0, most=0)
     own = [min(max(real - int(part[0]), 0), len(part)) for part in parts]
 
     def tick(samples: int) -> None:
@@ -145,8 +145,11 @@ class _Run:
         lanes = lambda v: np.broadcast_to(v, (self.count, *np.shape(v)))  # noqa: E731
         return jax.tree.map(lanes, (state, plant.measure(state)))
 
-    def stride(self, packed: Any, begin: int) -> tuple[Any, dict, dict, int, bool]:
+    def stride(self, packed: Any, begin: int, most: int = LONGEST) -> tuple[Any, dict, dict, int, bool]:
         """Carry out sample `begin` if it is decided, and go on up to one that is not.
+
+        Args:
+            most: samples to measure.
 
         Returns:
             ``(packed, seen, done, count, decided)``: the sample measured last, fields of what was measured since and of what
@@ -155,7 +158,7 @@ class _Run:
         settings = np.concatenate([self.controllers.settings, self.told[:, None]], axis=1)
         given = (packed, self.inputs[:, begin : begin + LONGEST + 1], settings)
         given = given if self.place is None else jax.device_put(given, self.place)
-        packed, rows, (count, decided) = _stride(self.leaves, *given, self.form, self.of_now)
+        packed, rows, (count, decided) = _stride(self.leaves, *given, most, self.form, self.of_now)
         seen, done = jax.tree.map(np.asarray, rows)
         return packed, seen, done, int(count), bool(decided)
 
@@ -167,7 +170,9 @@ class _Run:
         done = acted = 0  # only the first call has nothing to carry out
         while done < self.samples and not stopped():
             clock = Clock()
-            packed, seen, doings, count, decided = self.stride(packed, done)
+            # the sample after the last is measured, too: nothing else is carried out at the end
+            most = min(self.samples - done + 1 - acted, LONGEST)
+            packed, seen, doings, count, decided = self.stride(packed, done, most)
             seconds = clock.seconds
             # the first row of what was seen is the sample after the one that was carried out first
             first, carried, acted = done + acted, count - 1 + acted, 1
@@ -215,7 +220,7 @@ def _steady(plants: Lanes):
 
 
 @functools.partial(jax.jit, static_argnames=("form", "of_now"))
-def _stride(leaves, packed, inputs, settings, form, of_now: Packing):
+def _stride(leaves, packed, inputs, settings, most, form, of_now: Packing):
     """See `_Run.stride`."""
     cores, plants = rebuilt(form, leaves)
     now: Now = of_now.unpack(packed)
@@ -264,7 +269,7 @@ def _stride(leaves, packed, inputs, settings, form, of_now: Packing):
 
     def onward(carry):
         now, *_, count = carry
-        return (count == 0) | (now.decided.all() & (count < LONGEST))
+        return (count < most) & ((count == 0) | now.decided.all())
 
     table = lambda v: jnp.zeros((v.shape[0], LONGEST + 1, *v.shape[1:]), v.dtype)  # noqa: E731
     nothing = dict(mv_demand=now.mv, mv=now.mv, move=now.mv, plan=now.moment.state.plan)

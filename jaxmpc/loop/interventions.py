@@ -15,7 +15,7 @@ from jaxmpc.check import is_number
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.core import ControllerState
 from jaxmpc.errors import InputError
-from jaxmpc.problem.blocking import sample_moves
+from jaxmpc.problem.blocking import moves_of_samples
 from jaxmpc.problem.structure import Structure
 
 
@@ -73,7 +73,7 @@ class CarriedOut:
     def __init__(self, structure: Structure, made: dict[str, np.ndarray]):
         """Args: the structure, and what the sample that made the plan left behind."""
         self.made = made
-        self.moves = sample_moves(structure) @ made["plan"]
+        self.moves = moves_of_samples(structure, made["plan"])
         self.moves[0] = made["move"]  # the plan itself may be off by the tolerance of its solver
         self.positions = made["mv_demand"] + np.cumsum(self.moves, axis=0) - self.moves[0]
 

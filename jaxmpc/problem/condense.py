@@ -16,6 +16,7 @@ envelope of d^2 through the integers, a sum of deadzone terms with half widths 0
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -32,55 +33,67 @@ SUMMED_BYTES = 2**27  # of running sums, up to which they are worth their memory
 class Rows(eqx.Module):
     """The hard rows on the moves: positions at the block ends, oscillation (6.16), windows (6.6), MV after MV.
 
-    The rows of different MVs do not meet and are the same for all, so that products are those of one small matrix.
+    The rows of different MVs do not meet. Where all have the same blocks they are the same for all, so that products are
+    those of one small matrix; where not, there is one per MV.
     """
 
     # of one MV on its moves: positions of all blocks, differences of neighbouring blocks, windows
-    own: Float[Array, "row block"]
-    size: Float[Array, " row"]  # their squared lengths
-    count: Float[Array, " block"]  # samples that carry the move of a block
+    own: Float[Array, "*mv row block"]
+    size: Float[Array, "*mv row"]  # their squared lengths
+    count: Float[Array, "*mv block"]  # samples that carry the move of a block
 
     @classmethod
     def of_layout(cls, layout: Layout) -> Rows:
         """Those of a structure."""
-        blocks = layout.count.shape[0]
-        position = np.tri(blocks) * layout.count
-        own = jnp.concatenate([position, np.eye(blocks) - np.eye(blocks, k=-1), layout.window])
-        return cls(own, jnp.sum(own**2, axis=1), jnp.asarray(layout.count))
+        blocks = layout.count.shape[-1]
+        position = np.tri(blocks) * layout.count[..., None, :]
+        pair = jnp.broadcast_to(np.eye(blocks) - np.eye(blocks, k=-1), position.shape)
+        own = jnp.concatenate([position, pair, layout.window], axis=-2)
+        return cls(own, jnp.sum(own**2, axis=-1), jnp.asarray(layout.count))
 
     def of(self, x: Float[Array, " n"]) -> Float[Array, " hard"]:
         """W x."""
-        return (x.reshape(-1, self.own.shape[1]) @ self.own.T).reshape(-1)
+        return self._of_each(x, self.own)
 
     def touch(self, free: Float[Array, " n"]) -> Bool[Array, " hard"]:
         """Which rows have free moves (1, the others 0)."""
-        return (free.reshape(-1, self.own.shape[1]) @ jnp.abs(self.own).T).reshape(-1) > 0.0
+        return self._of_each(free, jnp.abs(self.own)) > 0.0
 
     def pull(self, prices: Float[Array, " hard"]) -> Float[Array, " n"]:
         """W' prices."""
-        return (prices.reshape(-1, self.own.shape[0]) @ self.own).reshape(-1)
+        by_mv = prices.reshape(-1, self.own.shape[-2])
+        if self.own.ndim == 2:
+            return (by_mv @ self.own).reshape(-1)
+        return jnp.einsum("mr,mrb->mb", by_mv, self.own).reshape(-1)
+
+    def _of_each(self, x: Float[Array, " n"], own: Float[Array, "*mv row block"]) -> Float[Array, " hard"]:
+        by_mv = x.reshape(-1, own.shape[-1])
+        if own.ndim == 2:
+            return (by_mv @ own.T).reshape(-1)
+        return jnp.einsum("mb,mrb->mr", by_mv, own).reshape(-1)
 
     def square(self, weights: Float[Array, " hard"]) -> Float[Array, "n n"]:
         """W' diag(weights) W, for weights of 0 or more."""
-        rows, blocks = self.own.shape
+        rows, blocks = self.own.shape[-2:]
         by_mv = weights.reshape(-1, rows)
         position, pair = by_mv[:, :blocks], by_mv[:, blocks : 2 * blocks]
         # blocks i and j share the positions from the later one on, whose weights add up to the smaller of two sums
         later = position @ np.tri(blocks)
-        own = jnp.minimum(later[:, :, None], later[:, None, :]) * (self.count[:, None] * self.count)
+        square = self.count[..., :, None] * self.count[..., None, :]
+        own = jnp.minimum(later[:, :, None], later[:, None, :]) * square
         after = jnp.pad(pair[:, 1:], ((0, 0), (0, 1)))
         own += np.eye(blocks) * (pair + after)[:, :, None]
         own -= np.eye(blocks, k=1) * pair[:, None, :] + np.eye(blocks, k=-1) * pair[:, :, None]
         if rows > 2 * blocks:
-            window = self.own[2 * blocks :]
-            own += window.T @ (by_mv[:, 2 * blocks :, None] * window)
+            window = self.own[..., 2 * blocks :, :]
+            own += jnp.swapaxes(window, -1, -2) @ (by_mv[:, 2 * blocks :, None] * window)
         apart = np.eye(len(by_mv))[:, None, :, None]
         n = len(by_mv) * blocks
         return (own[:, :, None, :] * apart).reshape(n, n)
 
-    def spread(self, of_one: Float[Array, " row"], mvs: int) -> Float[Array, " hard"]:
-        """Values of the rows of one MV, for all."""
-        return jnp.tile(of_one, mvs)
+    def spread(self, of_one: Float[Array, "*mv row"], mvs: int) -> Float[Array, " hard"]:
+        """Values of the rows of one MV or each, for all."""
+        return jnp.tile(of_one, mvs) if of_one.ndim == 1 else of_one.reshape(-1)
 
 
 class CondensedQp(eqx.Module):
@@ -110,7 +123,7 @@ class CondensedQp(eqx.Module):
     row_unit: Float[Array, " prediction"]  # its inverse in powers of `COARSE`, which changes at few samples
     bend: Float[Array, " n"]  # curvature of every move outside all deadzones
     reach: Float[Array, " cv"]  # what one unit of one move can do to a CV at most
-    whole: Bool[Array, " n"]  # moves of integer MVs
+    whole: Bool[Array, " n"]  # moves that are whole
     # curvature of the positions that is paid along the chords of their square and not in `hessian` (`integer.tighten`)
     position_weight: Float[Array, " hard"] | None
     # whether any CV limit is finite (static; without, their rows are left out)
@@ -149,16 +162,26 @@ def dynamic_matrix(
     Args:
         coefficients: S(1)..S(N); S keeps its last value beyond N.
     """
-    # a block of equal moves responds with the sum of delayed steps, S(0) = 0
+    if layout.start.ndim == 1:
+        return jnp.moveaxis(_responses(layout.start, layout.count, coefficients, j), 1, 2)
+    return jax.vmap(_responses, in_axes=(0, 0, 1, None), out_axes=2)(
+        layout.start, layout.count, coefficients, j
+    )
+
+
+def _responses(
+    start: Array, count: Array, coefficients: Float[Array, "*response future"], j: Array
+) -> Float[Array, "*response horizon block"]:
+    """To a unit move in each of some blocks; a block of equal moves responds with the sum of delayed steps, S(0) = 0."""
     longest = j.shape[0] + coefficients.shape[-1]
     step = coefficients[..., np.minimum(np.arange(longest), coefficients.shape[-1] - 1)]
-    summed = jnp.concatenate([jnp.zeros((*step.shape[:2], 1)), jnp.cumsum(step, axis=-1)], axis=-1)
-    delay = jnp.clip(j[:, None] - layout.start, 0, longest)
-    single = layout.count == 1.0  # no difference of two sums is needed, nor its rounding
-    before = jnp.where(single, delay, jnp.maximum(delay - layout.count.astype(int), 0))
-    padded = jnp.concatenate([jnp.zeros((*step.shape[:2], 1)), step], axis=-1)
-    columns = jnp.where(single, padded[..., delay], summed[..., delay] - summed[..., before])
-    return jnp.moveaxis(columns, 1, 2)
+    none = jnp.zeros((*step.shape[:-1], 1))
+    summed = jnp.concatenate([none, jnp.cumsum(step, axis=-1)], axis=-1)
+    delay = jnp.clip(j[:, None] - start, 0, longest)
+    single = count == 1.0  # no difference of two sums is needed, nor its rounding
+    before = jnp.where(single, delay, jnp.maximum(delay - count.astype(int), 0))
+    padded = jnp.concatenate([none, step], axis=-1)
+    return jnp.where(single, padded[..., delay], summed[..., delay] - summed[..., before])
 
 
 class Matrices(eqx.Module):
@@ -189,7 +212,8 @@ def matrices_of(
     n, rows = size.moves, size.cvs * size.horizon
     j, inside = penalised(layout, size)
     by_cv = dynamic_matrix(layout, coefficients, j).reshape(size.cvs, size.horizon, n)
-    by_cv = jnp.where(inside[:, None] & jnp.tile(layout.real, size.mvs), by_cv, 0.0)
+    real = jnp.broadcast_to(layout.real, (size.mvs, size.blocks)).reshape(-1)
+    by_cv = jnp.where(inside[:, None] & real, by_cv, 0.0)
     response = by_cv.reshape(rows, n)
     pay = summed and rows * n * (n + 1) // 2 * 8 <= SUMMED_BYTES
     return Matrices(
@@ -220,15 +244,14 @@ def condense(
     _, inside = penalised(layout, size)
     per_cv = lambda values: (values[:, None] * inside).reshape(-1)  # noqa: E731
     spread = lambda values: jnp.repeat(values, size.blocks)  # noqa: E731
-    weight = jnp.tile(layout.count, size.mvs) * spread(
-        tuning.move_weight
-    )  # paid at every sample of the block
+    counts = jnp.broadcast_to(layout.count, (size.mvs, size.blocks)).reshape(-1)
+    weight = counts * spread(tuning.move_weight)  # paid at every sample of the block
     tracking = 2.0 * jnp.einsum("c,cik->ik", tuning.cv_weight, matrices.squared)
     soft = tuning.soft_quadratic @ jnp.diagonal(matrices.squared, axis1=1, axis2=2)
     scale = _variable_scale(layout, size, tuning, jnp.diagonal(tracking) + 2.0 * (weight + soft))
     weight = weight * scale**2
     tracking = tracking * scale[:, None] * scale[None, :]
-    whole = spread(layout.integer)
+    whole = layout.whole.reshape(-1)
     own = jnp.where(whole, 0.0, 1.0) if envelope else jnp.ones(n)
     slopes = [(1.0 if m == 0 else 2.0) * jnp.where(whole, weight, 0.0) for m in range(envelope)]
     row_size = raw**2 @ scale**2

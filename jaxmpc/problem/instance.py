@@ -71,11 +71,11 @@ def make_instance(
 def _move_limits(layout: Layout, size: Size, tuning: Tuning, qp, mv_now, last_move, past_moves, recover):
     """Limits of x ``"mv block"`` and of the hard rows, lower and upper."""
     unit = qp.scale.reshape(size.mvs, size.blocks)[:, 0]
-    integer, per_mv = layout.integer[:, None], lambda values: values[:, None]
+    per_mv = lambda values: values[:, None]  # noqa: E731
     real, counts = layout.real, layout.count
 
     def whole(low, high):  # whole steps from wherever the MV is; float drift must not cost a step
-        return jnp.where(integer, whole_up(low), low), jnp.where(integer, whole_down(high), high)
+        return jnp.where(layout.whole, whole_up(low), low), jnp.where(layout.whole, whole_down(high), high)
 
     down, up = whole(per_mv(tuning.move_low / unit), per_mv(tuning.move_high / unit))
     room_down, room_up = whole(
@@ -90,7 +90,7 @@ def _move_limits(layout: Layout, size: Size, tuning: Tuning, qp, mv_now, last_mo
     high = jnp.where(falling, jnp.minimum(high, -1.0), high)
     # (6.16) against zero moves beside a block, and against the last move
     held = per_mv(jnp.round(last_move / unit))
-    watch = per_mv(tuning.oscillation_rows & layout.integer)
+    watch = per_mv(tuning.oscillation_rows) & layout.whole
     begin = np.arange(size.blocks) == 0
     low = jnp.where(watch & layout.single, jnp.maximum(low, -1.0), low)
     high = jnp.where(watch & layout.single, jnp.minimum(high, 1.0), high)
@@ -107,8 +107,8 @@ def _move_limits(layout: Layout, size: Size, tuning: Tuning, qp, mv_now, last_mo
     budget_up = jnp.maximum(total - kept, 0.0) / per_mv(unit)
     budget_down = jnp.maximum(total + kept, 0.0) / per_mv(unit)
     ends_low, ends_high = (jnp.broadcast_to(v, low.shape) for v in (room_down, room_up))
-    back_up = _fastest_return(layout, high, watch, held, budget_up, integer, sign=1.0)
-    back_down = _fastest_return(layout, low, watch, held, budget_down, integer, sign=-1.0)
+    back_up = _fastest_return(layout, high, watch, held, budget_up, sign=1.0)
+    back_down = _fastest_return(layout, low, watch, held, budget_down, sign=-1.0)
     ends_low = jnp.where(recover & (room_down > 0), jnp.minimum(ends_low, back_up), ends_low)
     ends_high = jnp.where(recover & (room_up < 0), jnp.maximum(ends_high, back_down), ends_high)
     # a range that follows from the MV limits keeps every box finite where the limits are
@@ -118,7 +118,7 @@ def _move_limits(layout: Layout, size: Size, tuning: Tuning, qp, mv_now, last_mo
     low = jnp.where(real, jnp.maximum(low, least), 0.0)
     high = jnp.where(real, jnp.minimum(high, largest), 0.0)
     width = jnp.where(watch & layout.coupled, 1.0, jnp.inf)
-    used = jnp.any(layout.window != 0.0, axis=1)
+    used = jnp.any(layout.window != 0.0, axis=-1)
     rows_low = ends_low, -width, -budget_down
     rows_high = ends_high, width, budget_up
     there = real, real, used
@@ -138,7 +138,7 @@ def whole_up(steps):
     return jnp.ceil(steps - DRIFT)
 
 
-def _fastest_return(layout: Layout, limit, watch, held, budget, integer, *, sign: float):
+def _fastest_return(layout: Layout, limit, watch, held, budget, *, sign: float):
     """Positions at the block ends when every move is as large as its limit, oscillation and window rows allow."""
     blocks = limit.shape[1]
     # a move is at most one step more than the one before it: the least of all earlier limits and the steps since
@@ -146,21 +146,22 @@ def _fastest_return(layout: Layout, limit, watch, held, budget, integer, *, sign
     reach = sign * jnp.concatenate([held, limit], axis=1)[:, None, :] + steps
     slowed = jnp.where(watch[:, :, None] & (steps >= 0) | (steps == 0), reach, jnp.inf).min(axis=2)
     move = jnp.where(jnp.isfinite(slowed), slowed, 1e9)
-    if layout.window.shape[0]:
-        move = _within_windows(move, watch, layout.window, budget, integer)
+    if layout.window.shape[-2]:
+        move = _within_windows(move, watch, layout, budget)
     return (layout.count * sign * move) @ np.tri(blocks).T
 
 
-def _within_windows(moves, watch, windows, budget, integer):
+def _within_windows(moves, watch, layout: Layout, budget):
     """The moves, block after block as large as the mean-move windows leave room for."""
     # the next move may have to be none, which the oscillation rows allow after one step
-    moves = jnp.where(watch & integer, jnp.minimum(moves, 1.0), moves)
+    moves = jnp.where(watch, jnp.minimum(moves, 1.0), moves)
+    windows, whole = jnp.asarray(layout.window), jnp.asarray(layout.whole)
 
     def one(block, moves):
-        share = windows[:, block]
-        used = jnp.where(np.arange(moves.shape[1]) < block, moves, 0.0) @ windows.T
+        share, before = windows[..., block], jnp.where(np.arange(moves.shape[1]) < block, moves, 0.0)
+        used = before @ windows.T if windows.ndim == 2 else jnp.einsum("mb,mwb->mw", before, windows)
         room = jnp.where(share > 0, (budget - used) / jnp.where(share > 0, share, 1.0), jnp.inf).min(axis=1)
-        room = jnp.maximum(jnp.where(integer[:, 0], whole_down(room), room), 0.0)
+        room = jnp.maximum(jnp.where(whole[:, block], whole_down(room), room), 0.0)
         return moves.at[:, block].min(room)
 
     return jax.lax.fori_loop(0, moves.shape[1], one, moves)

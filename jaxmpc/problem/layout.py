@@ -11,6 +11,7 @@ import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -47,6 +48,7 @@ class Size(NamedTuple):
     future: int
     windows: int  # rows of the predictive mean-move limit per MV; none in other modes
     past: int  # moves that the mean-move limit remembers
+    own_blocks: bool = False  # whether the MVs may have blocks of their own
 
     @classmethod
     def of(cls, structure: Structure, samples: int) -> Size:
@@ -59,6 +61,7 @@ class Size(NamedTuple):
             future=rung(max(structure.prediction_horizon, samples), HORIZON),
             windows=rung(len(window_rows(structure)), HORIZON) if len(window_rows(structure)) else 0,
             past=rung(structure.mean_move_window, WINDOW),
+            own_blocks=structure.own_blocks,
         )
 
     @property
@@ -76,25 +79,29 @@ class Size(NamedTuple):
 
     def __or__(self, other: Size) -> Size:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The size that holds structures of both."""
-        return Size(*map(max, self, other))
+        return Size(*map(max, self, other))  # pyright: ignore[reportArgumentType]
 
 
 class Layout(eqx.Module):
-    """A structure as arrays, padded to a `Size`."""
+    """A structure as arrays, padded to a `Size`.
 
-    start: Int[Array, " block"]  # first sample of every block
-    length: Int[Array, " block"]  # samples of every block, none of padding
-    count: Float[Array, " block"]  # samples that carry the move of a block (`blocking.moves_per_block`)
+    What blocks decide is there once for all MVs, or with an axis of the MVs before it where a size has `own_blocks`.
+    """
+
+    start: Int[Array, "*mv block"]  # first sample of every block
+    length: Int[Array, "*mv block"]  # samples of every block, none of padding
+    count: Float[Array, "*mv block"]  # samples that carry the move of a block (`blocking.moves_per_block`)
     # blocks of several samples of which only the first may move (blocking ``inputs``)
-    longer: Bool[Array, " block"]
-    single: Bool[Array, " block"]  # `blocking.single_step_blocks`
+    longer: Bool[Array, "*mv block"]
+    single: Bool[Array, "*mv block"]  # `blocking.single_step_blocks`
     # blocks whose move is coupled to the one before by an oscillation row (6.16)
-    coupled: Bool[Array, " block"]
-    window: Float[Array, "window block"]  # rows of the predictive mean-move limit (6.6)
+    coupled: Bool[Array, "*mv block"]
+    window: Float[Array, "*mv window block"]  # rows of the predictive mean-move limit (6.6)
     remaining: Float[Array, "window past"]  # past moves that are still inside each of these windows
     share: Float[Array, " past"]  # of the past moves in the reactive mean (6.6), 0 in other modes
     window_length: Float[Array, ""]  # samples of the window
-    shift: Float[Array, "block block"]  # the plan one sample later, in blocks again
+    shift: Float[Array, "*mv block block"]  # the plan one sample later, in blocks again
+    whole: Bool[Array, "mv block"]  # moves that are whole
     integer: Bool[Array, " mv"]  # integer MVs
     step: Float[Array, " mv"]  # their steps [MV unit], 1 for continuous ones
     first: Int[Array, ""]  # Hw
@@ -102,41 +109,38 @@ class Layout(eqx.Module):
     dt: Float[Array, ""]  # sampling interval [s]
 
     @property
-    def real(self) -> Bool[Array, " block"]:
+    def real(self) -> Bool[Array, "*mv block"]:
         """Blocks that are no padding."""
         return self.length > 0
+
+    def shifted(self, moves: Float[Array, "block mv"]) -> Float[Array, "block mv"]:
+        """A plan one sample later."""
+        if self.shift.ndim == 2:
+            return self.shift @ moves
+        return jnp.einsum("mbc,cm->bm", self.shift, moves)
 
 
 @functools.lru_cache(maxsize=256)
 def layout_of(structure: Structure, size: Size) -> Layout:
     """The arrays of a structure, NumPy's."""
     window = structure.mean_move_window
-
-    def padded(values, *shape) -> np.ndarray:
-        values = np.asarray(values)
-        return np.pad(values, [(0, n - have) for n, have in zip(shape, values.shape, strict=True)])
-
-    rows = window_rows(structure)
     predictive = structure.mean_move_mode == "predictive"
     # the window that ends at sample k of the horizon holds the last window - 1 - k past moves
     age = np.arange(size.past)[::-1]  # of the past moves, oldest first
     remaining = (age[None, :] < window - 1 - np.arange(size.windows)[:, None]) & predictive
-    counts = moves_per_block(structure)
-    later = np.eye(structure.control_horizon, k=1)
-    shift = block_members(structure).T @ later @ sample_moves(structure) / counts[:, None]
     step = structure.integer_step
+    whole = np.array([structure.whole_blocks(mv) for mv in range(size.mvs)])
+    if size.own_blocks:
+        each = [_of_blocks(structure, size, mv) for mv in range(size.mvs)]
+        blocks = {key: np.stack([own[key] for own in each]) for key in each[0]}
+    else:
+        blocks = _of_blocks(structure, size, 0)
     fields: dict[str, Any] = dict(
-        start=padded(block_starts(structure), size.blocks),
-        length=padded(structure.blocks, size.blocks),
-        count=padded(counts.astype(float), size.blocks),
-        longer=padded((np.asarray(structure.blocks) > 1) & (structure.blocking == "inputs"), size.blocks),
-        single=padded(single_step_blocks(structure), size.blocks),
-        coupled=padded(coupled_blocks(structure), size.blocks),
-        window=padded(rows, size.windows, size.blocks),
+        **blocks,
+        whole=np.arange(size.blocks) < whole[:, None],
         remaining=remaining.astype(float),
         share=np.where((age < window) & (not predictive), 1.0 / window, 0.0),
         window_length=np.asarray(float(window)),
-        shift=padded(shift, size.blocks, size.blocks),
         integer=np.array([s is not None for s in step]),
         step=np.array([1.0 if s is None else s for s in step]),
         first=np.asarray(structure.first_penalised),
@@ -144,3 +148,25 @@ def layout_of(structure: Structure, size: Size) -> Layout:
         dt=np.asarray(structure.dt),
     )
     return Layout(**fields)
+
+
+def _of_blocks(structure: Structure, size: Size, mv: int) -> dict[str, np.ndarray]:
+    """What the blocks of one MV decide."""
+
+    def padded(values, *shape) -> np.ndarray:
+        values = np.asarray(values)
+        return np.pad(values, [(0, n - have) for n, have in zip(shape, values.shape, strict=True)])
+
+    lengths, counts = np.asarray(structure.blocks_of(mv)), moves_per_block(structure, mv)
+    later = np.eye(structure.control_horizon, k=1)
+    shift = block_members(structure, mv).T @ later @ sample_moves(structure, mv) / counts[:, None]
+    return dict(
+        start=padded(block_starts(structure, mv), size.blocks),
+        length=padded(lengths, size.blocks),
+        count=padded(counts.astype(float), size.blocks),
+        longer=padded((lengths > 1) & (structure.blocking == "inputs"), size.blocks),
+        single=padded(single_step_blocks(structure, mv), size.blocks),
+        coupled=padded(coupled_blocks(structure, mv), size.blocks),
+        window=padded(window_rows(structure, mv), size.windows, size.blocks),
+        shift=padded(shift, size.blocks, size.blocks),
+    )

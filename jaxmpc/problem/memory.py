@@ -56,7 +56,8 @@ def check_ranges(structure: Structure, lower: np.ndarray, upper: np.ndarray) -> 
     if needed <= BUDGET and far.max(initial=0.0) <= FARTHEST:
         return
     most = np.maximum(width, far).max(axis=0)
-    mv = structure.integer_mvs[int(np.argmax(most)) // structure.block_count]
+    mvs = range(structure.mv_count)
+    mv = np.repeat(mvs, [structure.whole_blocks(mv) for mv in mvs])[int(np.argmax(most))]
     raise InputError(
         f"structure.integer_step.{structure.mv_names[mv]}",
         structure.integer_step[mv],

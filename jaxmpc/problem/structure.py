@@ -7,7 +7,8 @@ Programs are compiled for its size only (`layout`), and see what follows from it
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+import itertools
+from typing import Any, Literal
 
 from jaxmpc import html
 from jaxmpc.check import LARGEST, is_count, is_number
@@ -41,10 +42,10 @@ class Structure:
     first_penalised: int = declare(
         "samples", "first penalised sample", "the first j that costs anything", "H_w (5.1)", preset=1
     )
-    blocks: tuple[int, ...] = declare(
+    blocks: tuple[int, ...] | tuple[tuple[int, ...], ...] = declare(
         "samples",
         "lengths of the blocks",
-        "they sum to Hu; empty: no blocking",
+        "they sum to Hu; empty: no blocking; one list for all MVs, or one per MV",
         "(6.3)",
         preset=THESIS_BLOCKS,
     )
@@ -53,6 +54,14 @@ class Structure:
     )
     integer_step: tuple[float | None, ...] = declare(
         "MV unit", "step of {}", "None if continuous; empty if all are", "6.2", of="mv", preset=()
+    )
+    integer_horizon: tuple[int | None, ...] = declare(
+        "samples",
+        "integer horizon of {}",
+        "moves of blocks that begin after so many samples need not be whole; one number for all MVs, or one per MV; "
+        "None or empty: the control horizon",
+        of="mv",
+        preset=(),
     )
     mean_move_window: int = declare("samples", "window of the mean move", "", "6.6", preset=25)
     mean_move_mode: Literal["reactive", "predictive"] = declare(
@@ -77,16 +86,7 @@ class Structure:
                 self.first_penalised,
                 f"at most prediction_horizon = {self.prediction_horizon} samples",
             )
-        blocks = tuple(self.blocks) or (1,) * self.control_horizon
-        if not all(map(is_count, blocks)):
-            raise InputError("structure.blocks", list(blocks), "block lengths in whole samples, 1 or more")
-        object.__setattr__(self, "blocks", tuple(int(b) for b in blocks))
-        if sum(blocks) != self.control_horizon:
-            raise InputError(
-                "structure.blocks",
-                list(blocks),
-                f"lengths that sum to control_horizon = {self.control_horizon} samples (they sum to {sum(blocks)})",
-            )
+        object.__setattr__(self, "blocks", self._checked_blocks())
         for key, field in declared(Structure).items():
             value, expected = getattr(self, key), " or ".join(map(repr, field.choices))
             if expected and value not in field.choices:
@@ -106,6 +106,48 @@ class Structure:
         object.__setattr__(
             self, "integer_step", tuple(None if step is None else float(step) for step in steps)
         )
+        object.__setattr__(self, "integer_horizon", self._checked_horizon())
+
+    def _checked_blocks(self) -> tuple[int, ...] | tuple[tuple[int, ...], ...]:
+        """Lengths of the blocks, one list where those of all MVs are equal."""
+
+        def lengths(path: str, given: Any) -> tuple[int, ...]:
+            blocks = tuple(given) or (1,) * self.control_horizon
+            if not all(map(is_count, blocks)):
+                raise InputError(path, list(blocks), "block lengths in whole samples, 1 or more")
+            if sum(blocks) != self.control_horizon:
+                horizon = f"control_horizon = {self.control_horizon} samples"
+                raise InputError(
+                    path, list(blocks), f"lengths that sum to {horizon} (they sum to {sum(blocks)})"
+                )
+            return tuple(int(b) for b in blocks)
+
+        given = tuple(self.blocks)
+        if not any(isinstance(entry, (list, tuple)) for entry in given):
+            return lengths("structure.blocks", given)
+        lists: tuple[Any, ...] = given
+        if len(lists) != self.mv_count or not all(isinstance(entry, (list, tuple)) for entry in lists):
+            expected = f"one list of lengths for all MVs, or {self.mv_count} lists, one per MV"
+            raise InputError("structure.blocks", list(lists), expected)
+        named = zip(self.mv_names, lists, strict=True)
+        own = tuple(lengths(f"structure.blocks.{name}", entry) for name, entry in named)
+        return own[0] if len(set(own)) == 1 else own
+
+    def _checked_horizon(self) -> tuple[int | None, ...]:
+        """Integer horizons of the MVs, None for continuous ones and for the whole control horizon."""
+        given: Any = self.integer_horizon
+        if given is None or isinstance(given, bool) or is_number(given):
+            given = (given,) * self.mv_count
+        horizons = tuple(given) or (None,) * self.mv_count
+        if len(horizons) != self.mv_count:
+            expected = f"a number of samples for all MVs, or {self.mv_count} entries, one per MV"
+            raise InputError("structure.integer_horizon", list(horizons), expected)
+        for name, horizon in zip(self.mv_names, horizons, strict=True):
+            if horizon is not None and not is_count(horizon):
+                expected = "a whole number of samples, 1 or more"
+                raise InputError(f"structure.integer_horizon.{name}", horizon, expected)
+        integer = self.integer_mvs
+        return tuple(None if h is None or mv not in integer else int(h) for mv, h in enumerate(horizons))
 
     @property
     def cv_count(self) -> int:
@@ -118,9 +160,37 @@ class Structure:
         return len(self.mv_names)
 
     @property
+    def own_blocks(self) -> bool:
+        """Whether the MVs have blocks of their own."""
+        return isinstance(self.blocks[0], tuple)
+
+    def blocks_of(self, mv: int) -> tuple[int, ...]:
+        """Lengths of the blocks of one MV [samples]."""
+        blocks: Any = self.blocks
+        return blocks[mv] if self.own_blocks else blocks
+
+    @property
     def block_count(self) -> int:
-        """Number of blocks, the moves per MV that are decided."""
-        return len(self.blocks)
+        """Number of blocks, the moves per MV that are decided; of the MV with the most."""
+        return max(map(len, map(self.blocks_of, range(self.mv_count))))
+
+    def whole_blocks(self, mv: int) -> int:
+        """Number of blocks of one MV whose moves are whole: its first ones, none where it is continuous."""
+        blocks, horizon = self.blocks_of(mv), self.integer_horizon[mv]
+        if mv not in self.integer_mvs:
+            return 0
+        starts = itertools.accumulate(blocks[:-1], initial=0)
+        return len(blocks) if horizon is None else sum(start < horizon for start in starts)
+
+    @property
+    def relaxed_moves(self) -> bool:
+        """Whether an integer horizon leaves moves of an integer MV relaxed."""
+        return any(self.whole_blocks(mv) < len(self.blocks_of(mv)) for mv in self.integer_mvs)
+
+    @property
+    def integer_until(self) -> tuple[int, ...]:
+        """Samples of the control horizon, from the first on, whose moves are whole, per MV; 0 where it is continuous."""
+        return tuple(sum(self.blocks_of(mv)[: self.whole_blocks(mv)]) for mv in range(self.mv_count))
 
     @property
     def horizon_count(self) -> int:

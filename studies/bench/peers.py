@@ -51,6 +51,7 @@ class Peer:
     keeps: bool = False  # whether it is set up once for samples with equal matrices
     limit: int = 10_000  # samples it is asked at most, because it is slow
     hopeless: float = 10.0  # seconds after which one solve is cut off
+    bounds: bool = False  # whether it says what no plan is below
 
     def missing(self) -> str | None:
         """Why it cannot be used, None if it can."""
@@ -267,7 +268,8 @@ def scip(form: Form, tolerance: float, seconds: float) -> PeerAnswer:
 
     model = pyscipopt.Model()
     model.hideOutput()
-    limits = {"limits/time": seconds, "limits/gap": tolerance, "numerics/feastol": 1e-8}
+    exact = min(1e-8, tolerance / 10.0)
+    limits = {"limits/time": seconds, "limits/gap": tolerance, "numerics/feastol": exact}
     for name, value in limits.items():
         model.setParam(name, value)
     kinds = np.full(len(form.c), "C")
@@ -345,7 +347,7 @@ QP_PEERS = (
     Peer("qpax", "qpax", forms.dense, qpax, "solve, compiled before", limit=2),
 )
 MIQP_PEERS = (
-    Peer("SCIP", "pyscipopt", forms.lifted, scip, "solve", limit=5, hopeless=15.0),
-    Peer("Gurobi", "gurobipy", forms.lifted, gurobi, "solve", limit=20, hopeless=20.0),
+    Peer("SCIP", "pyscipopt", forms.lifted, scip, "solve", limit=5, hopeless=15.0, bounds=True),
+    Peer("Gurobi", "gurobipy", forms.lifted, gurobi, "solve", limit=20, hopeless=20.0, bounds=True),
     Peer("DAQP", "daqp", forms.dense, daqp, _ANEW, limit=5, hopeless=10.0),
 )

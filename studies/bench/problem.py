@@ -30,10 +30,22 @@ def read(case: dict) -> SimpleNamespace:
     n.hp, n.hu, n.hw = (
         structure[key] for key in ("prediction_horizon", "control_horizon", "first_penalised")
     )
-    n.blocks = list(structure.get("blocks") or [1] * n.hu)
-    n.starts = [0, *itertools.accumulate(n.blocks)][:-1]
+    given = structure.get("blocks")
+    own = given if isinstance(given, dict) else dict.fromkeys(model["mv"], given)
+    n.lists = [list(own[name] or [1] * n.hu) for name in model["mv"]]  # lengths of the blocks of every MV
+    n.begins = [[0, *itertools.accumulate(blocks)][:-1] for blocks in n.lists]
     n.blocking = structure["blocking"]
     n.step = [structure.get("integer_step", {}).get(name) for name in model["mv"]]
+    horizon = structure.get("integer_horizon", {})
+    horizon = horizon if isinstance(horizon, dict) else dict.fromkeys(model["mv"], horizon)
+    # how many blocks have whole moves, and how many samples these are
+    n.whole = [
+        sum(begin < horizon.get(name, n.hu) for begin in begins) if step else 0
+        for name, begins, step in zip(model["mv"], n.begins, n.step, strict=True)
+    ]
+    n.until = [sum(blocks[:whole]) for blocks, whole in zip(n.lists, n.whole, strict=True)]
+    if not isinstance(given, dict):  # those of all MVs
+        n.blocks, n.starts = n.lists[0], n.begins[0]
     n.oscillation = [bool(tuning.get("oscillation_rows", {}).get(name)) for name in model["mv"]]
     n.S = np.zeros((n.cvs, n.mvs, n.hp))
     for c, m in np.ndindex(n.cvs, n.mvs):
@@ -55,11 +67,9 @@ def sample_moves(case: dict, moves) -> np.ndarray:
     """The move of every sample, "sample mv", of a plan "block mv"."""
     n, moves = read(case), np.asarray(moves, dtype=float)
     du = np.zeros((n.hu, n.mvs))
-    for b, (start, length) in enumerate(zip(n.starts, n.blocks, strict=True)):
-        if n.blocking == "moves":
-            du[start : start + length] = moves[b]
-        else:
-            du[start] = moves[b]
+    for m in range(n.mvs):
+        for b, (start, length) in enumerate(zip(n.begins[m], n.lists[m], strict=True)):
+            du[start : start + (length if n.blocking == "moves" else 1), m] = moves[b, m]
     return du
 
 
@@ -113,7 +123,7 @@ def violation(case: dict, moves) -> float:
             if math.isfinite(limit):
                 worst = max(worst, (sign * (values - limit)).max() / max(1.0, abs(limit)))
         if n.step[m]:
-            d = du[:, m] / n.step[m]
+            d = du[: n.until[m], m] / n.step[m]
             worst = max(worst, np.abs(d - np.round(d)).max())
             if n.oscillation[m]:  # (6.16), the past move rounded to whole steps
                 past = round(n.last[m] / n.step[m])

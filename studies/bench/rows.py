@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import msgspec
@@ -22,7 +22,7 @@ _SHOWN = {
     "megabytes": "{} MB",
 }
 _LARGER_IS_BETTER = ("rate", "ratio")
-TEXTS = ("name", "floor", "aim", "met")  # columns of words; the others hold numbers
+TEXTS = ("name", "floor", "aim", "met", "found", "known", "by")  # columns of words; the others hold numbers
 
 
 class Goal(msgspec.Struct, frozen=True):
@@ -42,6 +42,17 @@ class Goal(msgspec.Struct, frozen=True):
         if self.quantity == "ratio" and row.ratio_is_lower_bound and value < self.floor:
             return None
         return value >= self.floor if self.quantity in _LARGER_IS_BETTER else value <= self.floor
+
+
+class Found(msgspec.Struct, frozen=True, kw_only=True):
+    """What became of one instance."""
+
+    status: str  # of the plan
+    objective: float | None  # of the plan, as it says
+    best: float | None  # objective known from elsewhere
+    certified: bool  # whether that is the optimum
+    gap: float | None  # relative, of the plan
+    finished_by: str | None
 
 
 class Row(msgspec.Struct, kw_only=True):
@@ -65,7 +76,8 @@ class Row(msgspec.Struct, kw_only=True):
     worst_error: float | None = None
     counts: bool = True  # whether no solution is wrong by more than `RIGHT`
     goals: tuple[Goal, ...] = ()  # floors and aims
-    note: str = ""  # how it was measured
+    note: str = ""  # how it was measured, or what is wrong
+    found: Found | None = None  # of a row that is one instance
 
 
 def timed(name: str, times: Sequence[float] | np.ndarray, errors: Any, **more: Any) -> Row:
@@ -117,26 +129,15 @@ class Report(msgspec.Struct, kw_only=True):
 def table(report: Report) -> str:
     """The rows as aligned text with the machine above and the notes below."""
     lines = [cells(row) for row in report.rows]
-    head = list(cells(Row(name="")))
-    widths = [
-        max(len(text) for text in column)
-        for column in zip(head, *(line.values() for line in lines), strict=True)
-    ]
-
-    def shown(texts: Iterable[str]) -> str:
-        cut = (
-            text.ljust(width) if name in TEXTS else text.rjust(width)
-            for text, name, width in zip(texts, head, widths, strict=True)
-        )
-        return "  ".join(cut).rstrip()
-
-    out = [", ".join(f"{key} {value}" for key, value in report.machine.items()), "", shown(head)]
+    heads = [name for name in cells(Row(name="")) if name == "name" or any(line[name] for line in lines)]
+    head, *lines = _aligned(heads, [[line[name] for name in heads] for line in lines])
+    out = [", ".join(f"{key} {value}" for key, value in report.machine.items()), "", head]
     section = None
     for row, line in zip(report.rows, lines, strict=True):
         if row.section != section:
-            out.append("-" * (sum(widths) + 2 * (len(widths) - 1)))
+            out.append("-" * len(head))
             section = row.section
-        out.append(shown(line.values()))
+        out.append(line)
     if any(not row.counts for row in report.rows):
         out += ["", f"! does not count: a solution is wrong by more than {RIGHT:g}, or there is none"]
     if any(row.ratio_is_lower_bound for row in report.rows):
@@ -151,6 +152,13 @@ def table(report: Report) -> str:
     return "\n".join(out) + "\n"
 
 
+def _aligned(heads: list[str], lines: list[list[str]]) -> list[str]:
+    """Heads and lines in columns, those of words to the left."""
+    widths = [max(map(len, column)) for column in zip(heads, *lines, strict=True)]
+    cut = lambda text, name, width: text.ljust(width) if name in TEXTS else text.rjust(width)  # noqa: E731
+    return ["  ".join(map(cut, line, heads, widths)).rstrip() for line in (heads, *lines)]
+
+
 def cells(row: Row) -> dict[str, str]:
     """The texts of one line by the heads of their columns."""
     tried = "" if row.instances is None else str(row.instances)
@@ -158,6 +166,8 @@ def cells(row: Row) -> dict[str, str]:
         tried = f"{row.solved} of {row.instances}"
     ratio = "" if row.ratio is None else f"{number(row.ratio)}x {row.ratio_to}"
     error = "" if row.worst_error is None else f"{row.worst_error:.0e}"
+    one = row.found or Found(status="", objective=None, best=None, certified=True, gap=None, finished_by=None)
+    exact = lambda value: "" if value is None else f"{value:.9g}"  # noqa: E731
     words = [{None: "-", True: "met", False: "missed"}[goal.met(row)] for goal in row.goals]
     if row.status != "measured":
         error = row.status
@@ -179,6 +189,10 @@ def cells(row: Row) -> dict[str, str]:
         "floor": ", ".join(said(goal, goal.floor) for goal in row.goals),
         "aim": ", ".join(said(goal, goal.aim) for goal in row.goals if goal.aim is not None),
         "met": ", ".join(words if len(set(words)) > 1 else words[:1]),
+        "found": f"{one.status} {exact(one.objective)}".strip(),
+        "known": exact(one.best) + " (open)" * (not one.certified),
+        "gap": "" if one.gap is None else f"{one.gap:.0e}",
+        "by": one.finished_by or "",
     }
 
 

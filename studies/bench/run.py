@@ -9,12 +9,15 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from jaxmpc.controller.case import case_to_dict
 from jaxmpc.files import write_atomically
 from jaxmpc.programs.interrupts import last_words
 from studies.bench.context import FULL, QUICK, Context, Size
+from studies.bench.folder import found, read, shipped, write
+from studies.bench.instances import MODES
 from studies.bench.peers import MIQP_PEERS, QP_PEERS, Peer
 from studies.bench.rows import Report, Row, table
-from studies.bench.sections import exact, growth, loops, relaxed, startup, sweeps
+from studies.bench.sections import exact, foreign, growth, loops, relaxed, startup, sweeps
 from studies.definition.refusing import require
 from studies.store.fingerprint import versions
 
@@ -23,6 +26,7 @@ SECTIONS: dict[str, Section] = {
     "relaxed": relaxed.one_at_a_time,
     "batch": relaxed.batches,
     "exact": exact.exact,
+    "foreign": foreign.foreign,
     "loop": loops.loops,
     "growth": growth.growth,
     "startup": startup.startup,
@@ -49,6 +53,8 @@ def run_bench(
     quick: bool = False,
     only: str | None = None,
     json_path: Path | None = None,
+    folder: Path | None = None,
+    certify: bool = False,
     size: Size | None = None,
     peers: tuple[tuple[Peer, ...], tuple[Peer, ...]] = (QP_PEERS, MIQP_PEERS),
     say: Callable[[str], None] | None = None,
@@ -60,6 +66,8 @@ def run_bench(
         quick: a few problems of a short run, under two minutes.
         only: sections with commas between, see `SECTIONS`; None for all.
         json_path: file that gets every row, replaced as a whole after each section.
+        folder: instances that are solved in place of the sections.
+        certify: ask the other solvers too, and write a ``truth.json`` into the folder.
         size: how much is measured, if neither the full nor the quick amount.
         peers: QP and MIQP solvers to compare with; ratios are to the first of each.
         say: receives lines of progress; standard error if not given.
@@ -69,17 +77,16 @@ def run_bench(
         `Report`; `complete` is False if a section ended early.
 
     Raises:
-        InputError: for an unknown section, before anything is measured.
+        InputError: for an unknown section, or a folder that cannot be read, before anything is measured.
         KeyboardInterrupt: after Ctrl-C; the rows so far are written and given to `stopped`.
     """
-    names = chosen_sections(only)
-    begin = time.perf_counter()
-
-    def progress(line: str) -> None:
-        print(f"[{time.perf_counter() - begin:6.1f} s] {line}", file=sys.stderr, flush=True)
-
-    context = Context(size or (QUICK if quick else FULL), quick, say or progress, *peers)
-    report = Report(machine=machine(peers), options={"quick": quick, "sections": names})
+    sections = {name: SECTIONS[name] for name in chosen_sections(only)}
+    require(folder is not None or not certify, "--certify", None, "a folder to --read")
+    if folder is not None:
+        instances = *read(folder), folder if certify else None
+        sections = {"read": lambda context: found(context, *instances)}
+    context = Context(size or (QUICK if quick else FULL), quick, say or _told(), *peers)
+    report = Report(machine=machine(peers), options={"quick": quick, "sections": list(sections)})
     report.series = context.series
 
     def keep() -> str:
@@ -90,18 +97,43 @@ def run_bench(
 
     with last_words(keep):
         ended = []
-        for name in names:
-            ended.append(_section(name, context, report))
+        for name, section in sections.items():
+            ended.append(_section(name, section(context), context, report))
             _write(report, json_path)
     report.complete = all(ended)
     _write(report, json_path)
     return report
 
 
-def _section(name: str, context: Context, report: Report) -> bool:
+def write_instances(folder: Path, *, quick: bool = False, only: str | None = None) -> None:
+    """Write the shipped instances with their optima (`only` "foreign", or None) or samples of the thesis run ("exact").
+
+    Raises:
+        InputError: for another section.
+    """
+    require(
+        only in (None, "foreign", "exact"), "--only", only, "foreign or exact, which have instances to write"
+    )
+    if only == "exact":
+        context = Context(QUICK if quick else FULL, quick, _told(), (), ())
+        recorded = (context.recordings.instances("mixed-integer", mode, context.size.exact) for mode in MODES)
+        cases, known = {name: body for some in recorded for name, body in some.files().items()}, {}
+    else:
+        shipped_cases, known = shipped()
+        cases = {name: case_to_dict(case) for name, case in shipped_cases.items()}
+    write(folder, cases, known)
+
+
+def _told() -> Callable[[str], None]:
+    """Lines of progress on standard error, with the time since now."""
+    begin = time.perf_counter()
+    return lambda line: print(f"[{time.perf_counter() - begin:6.1f} s] {line}", file=sys.stderr, flush=True)
+
+
+def _section(name: str, rows: Iterator[Row], context: Context, report: Report) -> bool:
     """Append the rows of a section; an error ends it with a row that says so. True if it came to its end."""
     try:
-        for row in SECTIONS[name](context):
+        for row in rows:
             row.section = name
             report.rows.append(row)
     except Exception as error:  # one section must not cost the others their rows
@@ -145,4 +177,4 @@ def machine(peers: tuple[tuple[Peer, ...], ...] = ()) -> dict[str, str]:
     return out
 
 
-__all__ = ["SECTIONS", "chosen_sections", "machine", "run_bench", "table", "wrong"]
+__all__ = ["SECTIONS", "chosen_sections", "machine", "run_bench", "table", "write_instances", "wrong"]

@@ -53,7 +53,11 @@ class Field:
         if self.kind == "text":
             return "one of " + ", ".join(self.choices)
         if self.kind == "lengths":
-            return f"lengths of blocks in whole samples, 1 or more and {LONGEST} together at most, such as [1, 1, 2, 4]"
+            own = " and ".join(MV_NAMES)
+            return (
+                f"lengths of blocks in whole samples, 1 or more and {LONGEST} together at most, such as [1, 1, 2, 4], "
+                f"or a list of them for each of {own}"
+            )
         words = "a whole number" if self.kind == "whole" else f"a {'' if self.infinite else 'finite '}number"
         if self.low > -math.inf:
             bounded = self.high < LARGEST
@@ -63,7 +67,7 @@ class Field:
     def check(self, path: str, value: Any) -> Any:
         """The value in its plain type, or an `InputError` that names `path`.
 
-        Numbers become floats, whole numbers ints, lengths tuples of ints.
+        Numbers become floats, whole numbers ints, lengths tuples of ints, one for all MVs or one per MV.
         """
         shown, hint = value, ""
         if self.kind == "flag":
@@ -72,8 +76,12 @@ class Field:
             good = isinstance(value, str) and value in self.choices
             hint = near(value, self.choices) if not good else ""
         elif self.kind == "lengths":
-            good = isinstance(value, (list, tuple)) and not any(isinstance(v, bool) for v in value)
-            good = good and all(isinstance(v, int) and v >= 1 for v in value) and 1 <= sum(value) <= LONGEST
+            if isinstance(value, dict):
+                value = [value[name] for name in MV_NAMES] if set(value) == set(MV_NAMES) else None
+            own = isinstance(value, (list, tuple)) and any(isinstance(v, (list, tuple)) for v in value)
+            lists = tuple(value or ()) if own else (value,)
+            good = len(lists) == (len(MV_NAMES) if own else 1) and all(map(_are_lengths, lists))
+            value = tuple(map(tuple, lists)) if good and own else value
         elif isinstance(value, bool) or not isinstance(value, (int, float)):
             good = False
         elif isinstance(value, int) and value.bit_length() > 63:  # no float has room for some of them
@@ -88,14 +96,15 @@ class Field:
         return {"whole": int, "number": float, "lengths": tuple}.get(self.kind, lambda same: same)(value)
 
     def parse(self, path: str, text: str) -> Any:
-        """The value that a cell of a CSV file holds; lengths are separated by spaces."""
+        """The value that a cell of a CSV file holds; lengths are separated by spaces, lists of the MVs by semicolons."""
         text = text.strip()
         value: Any = text
         try:
             if self.kind == "flag":
                 value = {"true": True, "false": False}.get(text.lower(), text)
             elif self.kind == "lengths":
-                value = [int(part) for part in text.split()]
+                lists = [[int(part) for part in own.split()] for own in text.split(";")]
+                value = lists if len(lists) > 1 else lists[0]
             elif self.kind == "whole":
                 value = int(text)
             elif self.kind == "number":
@@ -117,7 +126,19 @@ def as_text(value: Any) -> str:
     """A flag, text or list of lengths as it stands in a coordinate and in a CSV file."""
     if isinstance(value, bool):
         return "true" if value else "false"
-    return value if isinstance(value, str) else " ".join(str(v) for v in value)
+    if isinstance(value, str):
+        return value
+    return (
+        "; ".join(map(as_text, value))
+        if isinstance(value[0], (list, tuple))
+        else " ".join(str(v) for v in value)
+    )
+
+
+def _are_lengths(value: Any) -> bool:
+    """Whether it is one list of block lengths."""
+    good = isinstance(value, (list, tuple)) and not any(isinstance(v, bool) for v in value)
+    return good and all(isinstance(v, int) and v >= 1 for v in value) and 1 <= sum(value) <= LONGEST
 
 
 # -------------------------------------------------------------------------------------------------------- the well
@@ -166,7 +187,7 @@ def _table() -> dict[str, Field]:
         given: dict[str, Any] = dict(kind="text", choices=field.choices)
         given = given if field.choices else dict(kind="whole", low=1, high=LONGEST)
         given |= dict(unit=field.unit, default=field.default, shape=True)
-        return Field(key, field.meaning, **(given | more))
+        return Field(key, field.meaning.format(_SPOKEN["choke"]), **(given | more))
 
     out = [
         Field("controller", "controller", "", "text", "mixed-integer", ("continuous", "mixed-integer"), True),
@@ -178,6 +199,7 @@ def _table() -> dict[str, Field]:
         shaping("prediction_horizon"),
         shaping("control_horizon", default=None),
         shaping("first_penalised"),
+        shaping("integer_horizon", default=None),
         shaping("mean_move_window"),
         shaping("mean_move_mode"),
     ]

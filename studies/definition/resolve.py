@@ -170,12 +170,12 @@ def _structure(settings: Settings, k: int) -> Structure:
     """The structure of one scenario; without a control horizon the blocks decide it."""
     value = lambda key: settings.value(key, k)  # noqa: E731
     blocks, blocking = value("blocks"), value("blocking")
-    horizon = value("control_horizon") or sum(blocks)
+    horizon = value("control_horizon") or sum(blocks[0] if isinstance(blocks[0], tuple) else blocks)
     base = presets.structure("moves", integer=value("controller") == "mixed-integer")
-    same = ("prediction_horizon", "first_penalised", "mean_move_window", "mean_move_mode")
+    same = ("prediction_horizon", "first_penalised", "integer_horizon", "mean_move_window", "mean_move_mode")
 
     def place(field: str) -> str:
-        key = field.removeprefix("structure.")
+        key = field.removeprefix("structure.").partition(".")[0]
         partner = {"blocks": ["control_horizon"], "first_penalised": ["prediction_horizon"]}.get(key, [])
         return settings.table.blame([key, *filter(settings.given, partner)], k)
 

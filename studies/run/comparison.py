@@ -318,7 +318,7 @@ def _controller_variables(definition: ComparisonDefinition) -> dict[str, xr.Data
         dims = ("controller", field.of) if field.of else ("controller",)
         out[f"tuning_{key}"] = xr.DataArray(values, dims=dims, attrs=attrs)
     most = max(structure.block_count for structure in structures)
-    lengths = np.array([[*s.blocks, *[0] * (most - s.block_count)] for s in structures], dtype="i4")
+    lengths = np.array([[*s.blocks_of(0), *[0] * (most - s.block_count)] for s in structures], dtype="i4")
     what = "samples of a block, 0 beyond the last"
     out["block_length"] = labelled(lengths, ("controller", "block"), what, "1")
     for key, what in {

@@ -236,6 +236,8 @@ def test_a_scenario_is_numbered_in_plain_digits(scenario, tmp_path, capsys):
         ["fmu", "build", "--out", "{}.fmu"],
         ["bench", "--json", "{}"],
         ["bench", "--figures", "{}"],
+        ["bench", "--write", "{}"],
+        ["bench", "--read", "{}"],
         ["study", "run", "{}"],
         ["study", "run", "thesis", "--out", "{}"],
         ["study", "run", "deadzone", "--quick", "--store", "{}.zarr"],

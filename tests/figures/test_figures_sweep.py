@@ -361,6 +361,11 @@ def test_regret_is_against_the_thesis_blocking_at_the_same_weight_and_seed(tmp_p
     assert reference == "the thesis blocking"
 
 
+def test_blocks_of_each_mv_count_their_own_moves(tmp_path):
+    data = blocking_store(tmp_path / "a.zarr", blocks=(("1 1 2; 4", 120), ("1 3", 120)), modes=("moves",))
+    assert [(b.blocks, b.unknowns) for b in regret.blockings(data)] == [(3, 4), (2, 4)]
+
+
 def test_regret_is_against_the_best_where_the_thesis_blocking_is_not_in_the_study(tmp_path):
     data = blocking_store(
         tmp_path / "a.zarr",

@@ -47,22 +47,25 @@ class Answer:
 def integer_plans(
     case: dict, m: int, largest: float = math.inf, most: int = 200_000
 ) -> list[tuple[int, ...]]:
-    """All plans of one integer MV, in steps per block, that meet its hard constraints at every sample.
+    """All plans of one integer MV, in steps per whole block, that meet its hard constraints at every sample.
 
-    `largest` bounds the steps of one move where no limit does.
+    `largest` bounds the steps of one move where no limit does. Later moves are continuous: what they leave is reachable.
     """
     n = read(case)
     dlo, dhi, plo, phi = step_limits(n, m)
+    blocks, later = n.lists[m][: n.whole[m]], n.lists[m][n.whole[m] :]
     plans: list[tuple[int, ...]] = []
 
     def extend(plan, position, previous):
         b = len(plan)
-        if b == len(n.blocks):
+        if b == len(blocks):
+            if not _reachable(n, m, later, n.u0[m] + position * n.step[m]):
+                return
             plans.append(tuple(plan))
             if len(plans) > most:
                 raise OverflowError(f"more than {most} integer plans")
             return
-        length = n.blocks[b]
+        length = blocks[b]
         low, high = max(dlo, plo - position, -largest), min(dhi, phi - position, largest)
         if not (math.isfinite(low) and math.isfinite(high)):
             raise ValueError("an integer MV without any limit needs `largest`")
@@ -91,7 +94,7 @@ def hard_feasible(case: dict) -> bool:
             past = round(n.last[m] / n.step[m])
             cap = max([abs(x) for x in (dlo, dhi) if math.isfinite(x)] + [abs(past)]) + 2
             states = {(0, past)}
-            for length in n.blocks:
+            for length in n.lists[m][: n.whole[m]]:
                 reached = set()
                 for position, previous in states:
                     for d in range(int(max(dlo, -cap)), int(min(dhi, cap)) + 1):
@@ -104,25 +107,44 @@ def hard_feasible(case: dict) -> bool:
                         if plo <= end <= phi:
                             reached.add((end, 0 if held else d))
                 states = reached
-            if not states:
+            later = n.lists[m][n.whole[m] :]
+            if not any(_reachable(n, m, later, n.u0[m] + at * n.step[m]) for at, _ in states):
                 return False
-        else:
-            low, high = min(n.ulo[m], n.u0[m]), max(n.uhi[m], n.u0[m])
-            near, far = n.u0[m], n.u0[m]  # the interval of reachable positions
-            for length in n.blocks:
-                if n.blocking == "inputs" and length > 1 and not n.dlo[m] <= 0 <= n.dhi[m]:
-                    return False
-                count = 1 if n.blocking == "inputs" else length
-                near, far = max(low, near + count * n.dlo[m]), min(high, far + count * n.dhi[m])
-                if near > far + 1e-9 * max(1.0, abs(far)):
-                    return False
+        elif not _reachable(n, m, n.lists[m], n.u0[m]):
+            return False
     return True
+
+
+def _reachable(n, m: int, blocks: list[int], start: float) -> bool:
+    """Whether continuous moves of an MV over some blocks can keep its limits."""
+    low, high = min(n.ulo[m], n.u0[m]), max(n.uhi[m], n.u0[m])
+    near = far = start  # the interval of reachable positions
+    for length in blocks:
+        if n.blocking == "inputs" and length > 1 and not n.dlo[m] <= 0 <= n.dhi[m]:
+            return False
+        count = 1 if n.blocking == "inputs" else length
+        near, far = max(low, near + count * n.dlo[m]), min(high, far + count * n.dhi[m])
+        if near > far + 1e-9 * max(1.0, abs(far)):
+            return False
+    return True
+
+
+@dataclasses.dataclass
+class StepForm(Form):
+    """A form in which some moves of an integer MV may be continuous; padding of the plan is a variable of its own."""
+
+    whole: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0), bool))  # "block mv"
+
+    @property
+    def integers(self) -> np.ndarray:
+        """Positions of the integer variables."""
+        return self.starts[self.whole & self.integer]
 
 
 # --------------------------------------------------------------------------------------------- the full form
 
 
-def full_form(case: dict) -> Form:
+def full_form(case: dict) -> StepForm:
     """The problem (5.6) with Soft MPC (6.12), blocks (6.2), whole steps (6.1), oscillation rows (6.16)."""
     n = read(case)
     horizon = n.hp - n.hw + 1
@@ -136,9 +158,11 @@ def full_form(case: dict) -> Form:
 
     du, u, e = block(n.hu, n.mvs), block(n.hu, n.mvs), block(horizon, n.cvs)
     eps_high, eps_low, eta = block(n.cvs), block(n.cvs), block(horizon, n.cvs)
+    nothing = int(block(1)[0])  # the moves of a plan beyond the blocks of an MV
     total = next(count)
     q, c = np.zeros(total), np.zeros(total)
     low, high = np.full(total, -np.inf), np.full(total, np.inf)
+    low[nothing] = high[nothing] = 0.0
     rows: list[dict[int, float]] = []
     row_low: list[float] = []
     row_high: list[float] = []
@@ -150,25 +174,25 @@ def full_form(case: dict) -> Form:
             row_high.append(upper)
 
     for m in range(n.mvs):
-        if n.step[m]:
-            dlo, dhi, plo, phi = step_limits(n, m)
-        else:
-            dlo, dhi = n.dlo[m] / units[m], n.dhi[m] / units[m]
-            plo = min(0.0, (n.ulo[m] - n.u0[m]) / units[m])
-            phi = max(0.0, (n.uhi[m] - n.u0[m]) / units[m])
         for k in range(n.hu):
+            if k < n.until[m]:
+                dlo, dhi, plo, phi = step_limits(n, m)
+            else:
+                dlo, dhi = n.dlo[m] / units[m], n.dhi[m] / units[m]
+                plo = min(0.0, (n.ulo[m] - n.u0[m]) / units[m])
+                phi = max(0.0, (n.uhi[m] - n.u0[m]) / units[m])
             q[du[k, m]] = n.P[m] * units[m] ** 2
             low[du[k, m]], high[du[k, m]] = dlo, dhi  # (5.5a)
             low[u[k, m]], high[u[k, m]] = plo, phi
             before = [(u[k - 1, m], -1.0)] if k else []
             row([(u[k, m], 1.0), *before, (du[k, m], -1.0)], 0.0, 0.0)  # (5.4f)
-            if n.oscillation[m]:  # (6.16)
+            if n.oscillation[m] and k < n.until[m]:  # (6.16)
                 if k:
                     row([(du[k, m], 1.0), (du[k - 1, m], -1.0)], -1.0, 1.0)
                 else:
                     past = round(n.last[m] / n.step[m])
                     row([(du[0, m], 1.0)], past - 1.0, past + 1.0)
-        for start, length in zip(n.starts, n.blocks, strict=True):  # (6.3)
+        for start, length in zip(n.begins[m], n.lists[m], strict=True):  # (6.3)
             for k in range(start + 1, start + length):
                 same = [(du[start, m], -1.0)] if n.blocking == "moves" else []
                 row([(du[k, m], 1.0), *same], 0.0, 0.0)
@@ -204,7 +228,10 @@ def full_form(case: dict) -> Form:
                 high[slack] = 0.0
     place = [(r, k, v) for r, entries in enumerate(rows) for k, v in entries.items()]
     r_, k_, v_ = zip(*place, strict=True)
-    return Form(
+    starts = np.full((max(map(len, n.lists)), n.mvs), nothing)
+    for m, begins in enumerate(n.begins):
+        starts[: len(begins), m] = du[begins, m]
+    return StepForm(
         P=sp.csc_matrix(sp.diags(2 * q)),
         c=c,
         A=sp.csr_matrix((v_, (r_, k_)), shape=(len(rows), total)),
@@ -212,13 +239,14 @@ def full_form(case: dict) -> Form:
         row_high=np.array(row_high),
         low=low,
         high=high,
-        starts=du[n.starts],
+        starts=starts,
         units=units,
         integer=np.array([s is not None for s in n.step]),
+        whole=np.arange(len(starts))[:, None] < np.array(n.whole),
     )
 
 
-def _fixed(form: Form, steps=None) -> Form:
+def _fixed(form: StepForm, steps=None) -> StepForm:
     """The form without integers: relaxed, or with the integer moves fixed."""
     low, high = form.low.copy(), form.high.copy()
     if steps is not None:
@@ -226,7 +254,7 @@ def _fixed(form: Form, steps=None) -> Form:
     return dataclasses.replace(form, low=low, high=high, integer=np.zeros_like(form.integer))
 
 
-def solve_qp(case: dict, solver: str = "clarabel", fixed=None, form: Form | None = None) -> Answer:
+def solve_qp(case: dict, solver: str = "clarabel", fixed=None, form: StepForm | None = None) -> Answer:
     """The relaxed problem, or the one with the integer moves fixed, by somebody else's QP solver.
 
     The solvers run to 1e-10 in scaled units and `objective()` judges the plan. Over 3,000 random cases all that
@@ -235,7 +263,7 @@ def solve_qp(case: dict, solver: str = "clarabel", fixed=None, form: Form | None
     Args:
         case: the content of a case file.
         solver: ``clarabel`` or ``piqp`` (interior point), ``daqp`` (active set, dense: small cases only).
-        fixed: "block integer-mv" in steps.
+        fixed: the whole moves in steps, block by block, the MVs of a block one after the other.
         form: the full form of the case, if it is at hand.
     """
     form = form or full_form(case)
@@ -244,8 +272,9 @@ def solve_qp(case: dict, solver: str = "clarabel", fixed=None, form: Form | None
         return Answer(answer.status)
     moves = form.moves(answer.z)
     if fixed is not None:
-        moves[:, form.integer] = np.asarray(fixed, dtype=float).reshape(moves[:, form.integer].shape)
-        moves[:, form.integer] *= form.units[form.integer]
+        whole = form.whole & form.integer
+        moves[whole] = np.asarray(fixed, dtype=float).ravel()
+        moves *= np.where(whole, form.units, 1.0)
     return Answer("optimal", objective(case, moves), answer.bound, moves)
 
 
@@ -269,24 +298,26 @@ def brute_force(case: dict, solver: str = "piqp", most: int = 20_000) -> Answer:
     integer = [m for m in range(n.mvs) if n.step[m]]
     if not hard_feasible(case):
         return Answer("infeasible")
-    ceiling = objective(case, np.zeros((len(n.blocks), n.mvs)))
-    largest = (
-        math.inf if violation(case, np.zeros((len(n.blocks), n.mvs))) > 0 else integer_range(case, ceiling)
-    )
+    none = np.zeros((max(map(len, n.lists)), n.mvs))
+    ceiling = objective(case, none)
+    largest = math.inf if violation(case, none) > 0 else integer_range(case, ceiling)
     per_mv = [integer_plans(case, m, largest, most) for m in integer]
     if math.prod(len(plans) for plans in per_mv) > most:
         raise OverflowError(f"more than {most} integer plans")
     form = full_form(case)
     best = Answer("infeasible")
     for chosen in itertools.product(*per_mv):
-        steps = np.array(chosen, dtype=float).T.reshape(len(n.blocks), len(integer))
-        if len(integer) == n.mvs:
+        steps = np.zeros(none.shape)
+        for m, plan in zip(integer, chosen, strict=True):
+            steps[: len(plan), m] = plan
+        if n.whole == list(map(len, n.lists)):
             moves = steps * form.units
             found = Answer("optimal", objective(case, moves), -math.inf, moves)
         else:
-            found = solve_qp(case, solver, steps, form)
+            fixed = steps[form.whole & form.integer]
+            found = solve_qp(case, solver, fixed, form)
             if found.status != "optimal":
-                found = solve_qp(case, "clarabel", steps, form)
+                found = solve_qp(case, "clarabel", fixed, form)
             if found.status != "optimal":
                 raise ArithmeticError(f"no QP solver settles the integer plan {chosen}: {found.status}")
         if found.objective < best.objective:
@@ -341,7 +372,7 @@ def complaints(case: dict, plan, reference: Answer) -> list[str]:
         return [f"status {plan.status}, oracle {reference.status} {reference.objective}"]
     found = [] if plan.status == "optimal" else [f"status {plan.status}, oracle {reference.status}"]
     n, moves = read(case), np.asarray(plan.moves, dtype=float)
-    if moves.shape != (len(n.blocks), n.mvs) or not np.isfinite(moves).all():
+    if moves.shape != (max(map(len, n.lists)), n.mvs) or not np.isfinite(moves).all():
         return [*found, f"moves of shape {moves.shape}, or not finite"]
     if (worst := violation(case, moves)) > FEASIBLE:
         found.append(f"violates a hard constraint by {worst:.1e}")

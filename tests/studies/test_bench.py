@@ -10,6 +10,7 @@ from figures.thesis.solve_time import draw_benchmark
 from identify.step_test import identify_step_response
 from jaxmpc.cli import main as cli
 from jaxmpc.cli.options import parser as make_parser
+from jaxmpc.controller.case import case_to_dict, make_case
 from jaxmpc.controller.plan import Planner
 from jaxmpc.errors import InputError
 from jaxmpc.loop.reference import Reference
@@ -27,7 +28,6 @@ TINY = Size(
     run=25,
     relaxed=3,
     exact=2,
-    hardest=1,
     lanes=3,
     batches=(2,),
     cut_off=2.0,
@@ -52,6 +52,7 @@ ROW_KEYS = {
     "counts",
     "goals",
     "note",
+    "found",
 }
 
 
@@ -247,7 +248,7 @@ def test_exact_rows_are_judged_beside_a_peer_that_cannot_be_used(cache):
     broken = peer("Costly", begin=unlicensed)
     report = measure("exact", (), (broken,))
     assert report.complete
-    found = {row.name.partition(": ")[2]: row for row in report.rows if "longest" not in row.name}
+    found = {row.name.partition(": ")[2]: row for row in report.rows}
     assert found["Costly"].status == "failed"
     assert "licence" in found["Costly"].note
     assert found["jaxmpc"].counts
@@ -272,6 +273,36 @@ def test_batches_have_rates_and_figures(cache, tmp_path):
     assert draw_benchmark({"rows": [], "series": {}}, tmp_path / "none") == []
     with pytest.raises(InputError, match="benchmark results"):
         draw_benchmark(tmp_path / "none.json", tmp_path)
+
+
+def test_the_foreign_section_has_a_row_per_solver_and_their_times():
+    tiny = dataclasses.replace(TINY, foreign=("quadtank",), cut_off=60.0)
+    scip = peers.MIQP_PEERS[0]
+    lost = dataclasses.replace(
+        peer("Lost", bounds=True),
+        build=forms.lifted,
+        begin=lambda *_: lambda form: peers.PeerAnswer("limit", seconds=1.0),
+    )
+    report = run.run_bench(
+        only="foreign", size=tiny, peers=((), (scip, lost, peer("No bounds"))), say=lambda line: None
+    )
+    assert report.complete
+    assert run.wrong(report) == []
+    found = {row.name.partition(": ")[2]: row for row in report.rows}
+    assert list(found) == ["jaxmpc", "jaxmpc, HiGHS finish", "SCIP", "Lost"]
+    assert (found["jaxmpc"].solved, found["jaxmpc"].instances) == (2, 2)
+    assert found["SCIP"].worst_error <= 1e-6
+    assert found["Lost"].solved == 0
+    assert {name: len(times) for name, times in report.series["foreign"].items()} == dict.fromkeys(found, 2)
+    assert np.isinf(report.series["foreign"]["Lost"]).all()
+
+
+def test_recorded_samples_are_case_files(model, reference, cache):
+    recorded = Recordings(model, reference, 20).instances("continuous", MODE, 4)
+    files = recorded.files()
+    assert set(files) == {f"well_{MODE}_{sample}" for sample in recorded.sample}
+    for body in files.values():
+        assert case_to_dict(make_case(json.loads(json.dumps(body)))) == body
 
 
 def test_a_row_without_a_measurement_meets_nothing_and_a_wrong_one_misses():

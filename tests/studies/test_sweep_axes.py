@@ -76,6 +76,20 @@ def test_linked_keys_move_together_inside_a_grid():
     assert [c.label for c in made.columns][:2] == ["lengths", "horizon"]
 
 
+def test_blocks_of_each_mv_and_integer_horizons_vary_like_any_key():
+    own = {"choke": [1, 1, 2], "gas_lift": [4]}
+    axes = {"key": "blocks", "values": [[1, 3], own]}, {"key": "integer_horizon", "values": [1, 2]}
+    made = study(*axes)
+    assert values(made) == {
+        "blocks": ["1 3", "1 3", "1 1 2; 4", "1 1 2; 4"],
+        "integer_horizon": [1, 2, 1, 2],
+    }
+    structures = [made.scenario(k).structure for k in range(4)]
+    assert [s.blocks for s in structures[1:3]] == [(1, 3), ((1, 1, 2), (4,))]
+    assert [s.integer_until for s in structures] == [(1, 0), (4, 0), (1, 0), (2, 0)]
+    assert {s.control_horizon for s in structures} == {4}
+
+
 def test_ranges_include_their_ends_and_have_plain_decimals():
     linear = {"key": DEADZONE, "range": {"from": 0, "to": 0.5, "count": 6}}
     assert values(study(linear))[DEADZONE] == [0, 0.1, 0.2, 0.3, 0.4, 0.5]
@@ -161,6 +175,13 @@ def test_one_file_gives_several_keys_by_the_names_of_its_columns(table):
     own = {"key": "blocks", "csv": {"file": "cases.csv"}}
     made = values(study(single, own, folder=table))
     assert made["blocks"] == ["1 1 2", "4 4"] * 2
+
+
+def test_a_cell_holds_the_blocks_of_each_mv_separated_by_a_semicolon(tmp_path):
+    (tmp_path / "own.csv").write_text("blocks,integer_horizon\n1 1 2; 4,1\n1 3,4\n")
+    made = study(sampling={"method": "list", "file": "own.csv"}, folder=tmp_path)
+    assert values(made) == {"blocks": ["1 1 2; 4", "1 3"], "integer_horizon": [1, 4]}
+    assert made.scenario(0).structure.blocks == ((1, 1, 2), (4,))
 
 
 def test_a_list_takes_every_row_of_a_file_as_a_scenario(tmp_path):

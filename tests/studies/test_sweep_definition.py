@@ -82,6 +82,13 @@ BAD_BASE = {
         "100",
     ),
     "empty blocks": ({"blocks": []}, "base.blocks", "whole samples"),
+    "blocks of one MV alone": ({"blocks": {"choke": [1, 1]}}, "base.blocks", "each of choke and gas_lift"),
+    "blocks of MVs that end apart": (
+        {"blocks": {"choke": [1, 1], "gas_lift": [3]}},
+        "base.blocks",
+        "sum to control_horizon = 2 samples",
+    ),
+    "an integer horizon of nothing": ({"integer_horizon": 0}, "base.integer_horizon", "from 1 to 10000"),
     "a choke beyond the step test": ({"model": {"choke": 99}}, "base.model.choke", "from 0 to 98 [%]"),
     "negative noise": ({"noise": {"oil_rate": -0.1}}, "base.noise.oil_rate", "m3/h"),
     "half a seed": ({"seed": 0.5}, "base.seed", "whole number"),

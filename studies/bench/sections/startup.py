@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.controller.plan import Planner
+from jaxmpc.controller.case import make_case
 from studies.bench.context import Context
+from studies.bench.folder import solve
 from studies.bench.judge import Judge, taken
 from studies.bench.rows import Goal, Row, whole
 
@@ -26,17 +27,10 @@ def startup(context: Context) -> Iterator[Row]:
     """Rows ``first call, MODE``: `jaxmpc plan` on a recorded sample with an empty compilation cache, and again."""
     for mode in context.size.startup_modes:
         instances = context.recordings.instances("mixed-integer", mode, 5)
-        cases = instances.cases()
-        # a case file has no limits of the first move alone
-        held = [np.isfinite(case["first_move_high"] + case["first_move_low"]).any() for case in cases]
-        free = np.flatnonzero(~np.array(held)).tolist()
-        i = free[len(free) // 2]
-        case = {key: value for key, value in cases[i].items() if not key.startswith("first_move")}
+        cases = list(instances.files().values())
+        case = cases[len(cases) // 2]
         judge = Judge([case])
-        planner = Planner(instances.structure, instances.tuning, instances.model)
-        problem = instances.now.at(i)
-        problem["past_moves"] = None
-        judge.hear("in process", [planner.solve(**problem).moves])
+        judge.hear("in process", [solve(make_case(case), PATIENCE)[1].moves])
         with tempfile.TemporaryDirectory(prefix="jaxmpc-bench-") as folder:
             for call, words in CALLS.items():
                 context.say(f"{call} call, {mode}")
