@@ -234,11 +234,11 @@ def dump_case(case: Case, path: str | Path) -> Path:
 def plan_to_dict(plan: Any) -> dict[str, Any]:
     """The content of a plan file: the fields of a `Plan`, with null where a number is not finite.
 
-    `integer_until` is among them where an integer horizon leaves moves relaxed.
+    The reason is there only where the plan is not optimal, `integer_until` where an integer horizon leaves moves relaxed.
     """
-    until = getattr(plan, "integer_until", None)
+    some = {name: _plain(getattr(plan, name, None)) for name in ("reason", "integer_until")}
     body = {name: _plain(getattr(plan, name)) for name in _PLAN}
-    return body if until is None else body | {"integer_until": _plain(until)}
+    return body | {name: value for name, value in some.items() if value is not None}
 
 
 def _plain(value: Any) -> Any:

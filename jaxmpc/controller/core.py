@@ -261,11 +261,12 @@ class Core(eqx.Module):
         form: dict[str, Any] = dict(envelope=self.qp.steep.shape[0], has_limits=self.qp.has_limits)
         return condense(self.layout, self.size, tuning, matrices, **form)
 
-    def consider(self, state: ControllerState, sample: Sample, gap, search=True) -> Moment:
+    def consider(self, state: ControllerState, sample: Sample, gap, search=True, most=np.inf) -> Moment:
         """Observe, pose and decide a sample.
 
         Args:
             search: whether whole moves may be searched for here; otherwise none but the relaxation is solved.
+            most: Newton steps after which it gives up.
         """
         state, free_response = self.observe(state, sample.cv, sample.mv, sample.manual)
         tuning = without(self.limits_now(state), state.sensors.off)
@@ -278,7 +279,7 @@ class Core(eqx.Module):
             standing = eqx.tree_at(lambda s: s.mv, state, state.mv + correction)
         instance = self.instance(standing, qp, tuning, free_response, sample.setpoint)
         tables = eqx.tree_at(lambda t: t.known, tables, tables.known & search)
-        decision = decide(qp, tables, instance, state.warm, gap)
+        decision = decide(qp, tables, instance, state.warm, gap, most)
         recovering = outside_limits(tuning, state.mv)
         if correction is not None:
             recovering |= jnp.any(correction != 0.0)

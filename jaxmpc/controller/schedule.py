@@ -212,7 +212,7 @@ class ScheduledCore(Core):
 
     schedule: ModelSchedule
 
-    def consider(self, state: ControllerState, sample: Sample, gap, search=True) -> Moment:
+    def consider(self, state: ControllerState, sample: Sample, gap, search=True, most=np.inf) -> Moment:
         """Observe, pose and decide a sample with the model of the present MVs."""
         standing = self.locate(state, sample.mv, sample.manual).mv
         coefficients = _register(self.schedule, standing, self.size.future)
@@ -220,7 +220,7 @@ class ScheduledCore(Core):
         qp = self.condensed(self.tuning, matrices)
         tables = eqx.tree_at(lambda t: t.scale, self.tables, qp.unit)
         now = Core(self.layout, self.tuning, coefficients, qp, tables, self.size, self.switching)
-        return now.consider(state, sample, gap, search)
+        return now.consider(state, sample, gap, search, most)
 
     def moving(self, before: Float[Array, " mv"], move: Float[Array, " mv"]) -> Float[Array, "cv mv future"]:
         """Coefficients half-way along a move."""

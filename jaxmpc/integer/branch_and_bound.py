@@ -99,11 +99,14 @@ def branch_and_bound(
     limits = MoveLimits(lower, upper, *position_limits(search.chains))
     tree.keep(_Node(root_bound, limits, model, root.start(0)))
     while True:
-        least = tree.least
+        least = search.still_open = tree.least
         if least >= search.cutoff:
             search.discard(least)
             return np.inf
-        if search.out_of_time() or tree.held > HELD:
+        if tree.held > HELD:
+            search.reason = "the open nodes of branch and bound take the memory that they may, a gigabyte"
+            return least
+        if search.out_of_time():
             return least
         yield from tree.step()
 
@@ -150,6 +153,7 @@ class _Tree:
         """Branch the followed node, and as many of least bound as fill a batch; keeps their children."""
         search, plans, children = self.search, [], []
         while len(children) < LANES and (node := self._take()) is not None:
+            search.check_time()
             if node.bound >= search.cutoff:
                 search.discard(node.bound)
                 continue
@@ -496,7 +500,9 @@ class _Tree:
         if not np.isfinite(search.value) or self._log_size(node) > self.list_up_to:
             return False
         chains = within(search.chains, limits)
-        found = enumerate_below(model, chains, limits.lower, limits.upper, search.cutoff, LISTED)
+        found = enumerate_below(
+            model, chains, limits.lower, limits.upper, search.cutoff, LISTED, check_time=search.check_time
+        )
         if found is None:
             self.list_up_to -= 1.0
             return False

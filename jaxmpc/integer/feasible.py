@@ -12,11 +12,11 @@ from __future__ import annotations
 import bisect
 import dataclasses
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxmpc.integer.actuators import Actuator
 from jaxmpc.problem.blocking import block_starts, coupled_blocks, moves_per_block, window_rows
@@ -28,6 +28,7 @@ NEAR = (3, 30)  # steps around the wanted moves in which the nearest are looked 
 MOST = 20_000_000  # combinations of position and move that are looked at in one chain
 HELD = 2_000_000  # of them that are remembered
 HOPS = 100_000  # pairs of allowed positions that propagation looks at
+CHECKED = 100  # of them between two looks at the clock
 UNBOUNDED = 10**12  # whole steps that stand for "no limit" in integer arithmetic
 SLACK = 1e-7  # by which limits of continuous moves may miss each other [scaled moves]
 
@@ -435,40 +436,51 @@ def fastest_return(
 
 
 def nearest(
-    chains: list[Chain], wanted: np.ndarray, lower: np.ndarray, upper: np.ndarray
+    chains: list[Chain],
+    wanted: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    check_time: Callable[[], None] = lambda: None,
 ) -> np.ndarray | None:
     """Feasible whole moves closest to `wanted` in the sum of absolute differences, or None where there are none.
 
     Window rows are not looked at. Dynamic programming over (position, last move), exact; costs milliseconds and is
     called only when rounding breaks a hard row.
 
+    Args:
+        chains: the hard rows.
+        wanted: moves [steps].
+        lower, upper: limits of the moves.
+        check_time: called now and then; may raise to end it.
+
     Raises:
         UndecidedError: where there are more moves and positions than can be looked at.
     """
     result = np.zeros(len(wanted), dtype=int)
     for chain in chains:
-        path = _nearest_in_chain(chain, wanted[chain.columns], lower[chain.columns], upper[chain.columns])
+        own = chain.columns
+        path = _nearest_in_chain(chain, wanted[own], lower[own], upper[own], check_time)
         if path is None:
             return None
         result[chain.columns] = path
     return result
 
 
-def _nearest_in_chain(chain: Chain, wanted, lower, upper) -> list[int] | None:
+def _nearest_in_chain(chain: Chain, wanted, lower, upper, check_time) -> list[int] | None:
     """Of one MV: among the moves around the wanted ones first, which are few."""
     around = whole(wanted)
     for reach in NEAR:
         low, high = np.maximum(lower, around - reach), np.minimum(upper, around + reach)
         if (low == lower).all() and (high == upper).all():
             break
-        path = _among(chain, wanted, low, high)
+        path = _among(chain, wanted, low, high, check_time)
         # paths that leave these limits have a move that alone is farther away
         if path is not None and np.abs(path - wanted).sum() <= reach:
             return path
-    return _among(chain, wanted, lower, upper)
+    return _among(chain, wanted, lower, upper, check_time)
 
 
-def _among(chain: Chain, wanted, lower, upper, outside=None) -> list[int] | None:
+def _among(chain: Chain, wanted, lower, upper, check_time=lambda: None, outside=None) -> list[int] | None:
     """Of one MV, by dynamic programming over all moves within these limits.
 
     The nearest to the wanted moves, or without any those whose positions are the least outside two limits.
@@ -481,7 +493,9 @@ def _among(chain: Chain, wanted, lower, upper, outside=None) -> list[int] | None
         layer: dict = {}
         remember = b + 1 < len(lower) and chain.coupled[b + 1]
         count = int(chain.counts[b])
-        for state, (cost, _, _) in layers[-1].items():
+        for number, (state, (cost, _, _)) in enumerate(layers[-1].items()):
+            if number % CHECKED == 0:
+                check_time()
             position, last, moved = state
             first, final = int(lower[b]), int(upper[b])
             if chain.coupled[b]:
@@ -532,3 +546,30 @@ def _choices(
     ]
     moves = [(end - position) // count for end in ends if (end - position) % count == 0]
     return [m for m in moves if count == 1 or all(position + k * m in known for k in range(1, count))]
+
+
+def held_within(
+    structure: Structure, size: Size, instance: QpInstance, x: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """Moves that need not be whole near `x` that keep their limits: block after block, the end always within reach.
+
+    The others stay as they are; where the limits leave no moves at all, some are broken.
+    """
+    by_mv = lambda values: np.reshape(values, (size.mvs, -1))  # noqa: E731
+    lower, upper = by_mv(instance.lower), by_mv(instance.upper)
+    row_low, row_high = by_mv(instance.row_low), by_mv(instance.row_high)
+    x = np.array(x)
+    for mv in range(size.mvs):
+        counts, whole_blocks = moves_per_block(structure, mv), structure.whole_blocks(mv)
+        # positions from which all later limits can be kept
+        least, most = row_low[mv, : len(counts)].copy(), row_high[mv, : len(counts)].copy()
+        for b in range(len(counts) - 2, -1, -1):
+            least[b] = max(least[b], least[b + 1] - counts[b + 1] * upper[mv, b + 1])
+            most[b] = min(most[b], most[b + 1] - counts[b + 1] * lower[mv, b + 1])
+        position, own = 0.0, by_mv(x)[mv]
+        for b, count in enumerate(counts):
+            low = max(lower[mv, b], (least[b] - position) / count)
+            high = min(upper[mv, b], (most[b] - position) / count)
+            own[b] = min(max(own[b], low), high) if b >= whole_blocks and low <= high else own[b]
+            position += count * own[b]
+    return x

@@ -26,7 +26,7 @@ from jaxmpc.integer.feasible import (
     satisfied,
     whole,
 )
-from jaxmpc.integer.host_search import SearchResult
+from jaxmpc.integer.host_search import NOT_CLOSED, Known, SearchResult
 from jaxmpc.integer.relaxer import Relaxations, Relaxer
 from jaxmpc.integer.solve import solve_integers
 from jaxmpc.integer.tables import Constants
@@ -34,7 +34,8 @@ from jaxmpc.problem.instance import QpInstance
 from jaxmpc.problem.memory import check_ranges
 from jaxmpc.programs.clock import Clock
 from jaxmpc.relaxed.gap import closes
-from jaxmpc.status import LIMIT, OPTIMAL
+from jaxmpc.relaxed.newton import MOST_STEPS
+from jaxmpc.status import LIMIT, OPTIMAL, UNPROVEN
 
 WIDEST_ENVELOPE = 4  # steps up to which the envelope of the squared integer move is built
 
@@ -50,7 +51,8 @@ def finish_steps(
     finish: str,
     actuators: Sequence[Sequence[Actuator]] = (),
     recover: bool = False,
-    spent: float = 0.0,
+    spent: float | Float[np.ndarray, " scenario"] = 0.0,
+    known: Sequence[Known] | None = None,
 ) -> list[SearchResult]:
     """Solve one step of every scenario; all have the same integer moves.
 
@@ -65,6 +67,7 @@ def finish_steps(
         actuators: what the integer MVs must keep besides limits and rows, per scenario; none if that is all.
         recover: let MVs outside their limits return the shortest way that these leave.
         spent: seconds that every scenario has taken already.
+        known: what the compiled search has found for moves of one step, per scenario.
 
     Returns:
         How the steps ended.
@@ -84,21 +87,38 @@ def finish_steps(
     if widest > 1:
         relaxer = relaxer_of(widest if widest <= WIDEST_ENVELOPE else 0)
         instances = eqx.tree_at(lambda i: (i.lower, i.upper), instances, (lower, upper))
-        root = relaxer.solve_roots(instances, relaxer.cold(instances))
+        most = relaxer.pace.steps_within(_left(time_limit, spent, clock))
+        root = relaxer.solve_roots(instances, relaxer.cold(instances), most)
+        # (6.6) of more than one step is more than the compiled search pays
+        known = None if known is None else [one._replace(value=np.inf) for one in known]
+    elif time_limit is not None and ((root.status != OPTIMAL) & (root.steps < MOST_STEPS)).any():
+        # the time it was given was a guess
+        left = _left(time_limit, spent, clock)
+        if relaxer.pace.fits(left):
+            root = relaxer.solve_roots(instances, root.warm, relaxer.pace.steps_within(left))
     starts = []
     for i, moves in enumerate(previous_moves):
         own = relaxer.scenario(i)
         wanted = moves.T.reshape(-1)[own.integer] / own.scales[own.integer]
         starts.append([np.clip(np.nan_to_num(wanted), -1e6, 1e6)])
     rest: dict[str, Any] = dict(gap=gap, time_limit=time_limit, finish=finish, actuators=actuators)
-    spent += clock.seconds / len(starts)
-    found = solve_integers(relaxer, instances, root, starts=starts, last=False, spent=spent, **rest)
+    used = np.broadcast_to(spent + clock.seconds / len(starts), len(starts))
+    found = solve_integers(
+        relaxer, instances, root, starts=starts, last=False, spent=used, known=known, **rest
+    )
     for i, result in enumerate(found):
-        late = time_limit is not None and result.seconds >= time_limit
-        if result.status == LIMIT and not late and relaxer.scenario(i).chord_weight.any():
-            own = rest | {"actuators": actuators[i : i + 1]}
-            found[i] = _tightened(relaxer, instances, i, result, starts[i], own)
+        left = None if time_limit is None else time_limit - result.seconds
+        if result.status in (LIMIT, UNPROVEN) and (left is None or left > 0):
+            weight = relaxer.scenario(i).chords_within(left)
+            if weight is not None and weight.any():
+                own = rest | {"actuators": actuators[i : i + 1]}
+                found[i] = _tightened(relaxer, instances, i, result, starts[i], own)
     return found
+
+
+def _left(time_limit: float | None, spent, clock: Clock) -> float | None:
+    """Seconds that the scenario with the least still has."""
+    return None if time_limit is None else time_limit - float(np.max(spent)) - clock.seconds
 
 
 def _tightened(
@@ -107,10 +127,12 @@ def _tightened(
     """The search of one scenario that is still open, on its tighter relaxation."""
     clock, own = Clock(), relaxer.with_chords(index)
     one = jax.tree.map(lambda leaf: leaf[index : index + 1], instances)
-    root = own.solve_roots(one, own.cold(one))
+    most = own.pace.steps_within(_left(rest["time_limit"], found.seconds, clock))
+    root = own.solve_roots(one, own.cold(one), most)
     if found.x is not None:
         starts = [*starts, whole(found.x[own.scenario(0).integer])]
-    (result,) = solve_integers(own, one, root, starts=[starts], spent=found.seconds + clock.seconds, **rest)
+    used = np.array([found.seconds + clock.seconds])
+    (result,) = solve_integers(own, one, root, starts=[starts], spent=used, **rest)
     result.nodes, result.root = result.nodes + found.nodes, found.root
     bound = max(result.bound, found.bound)
     if found.value < result.value:  # time ran out before the second search came so far
@@ -119,7 +141,10 @@ def _tightened(
     closed = closes(result.value, result.bound, own.scenario(0).scale, rest["gap"])
     if result.x is not None and closed != (result.status == OPTIMAL):
         by = result.finished_by or "branch-and-bound"
-        result.status, result.finished_by = (OPTIMAL, by) if closed else (LIMIT, None)
+        if closed:
+            result.status, result.finished_by, result.reason = OPTIMAL, by, None
+        else:
+            result.status, result.finished_by, result.reason = UNPROVEN, None, NOT_CLOSED
     return result
 
 

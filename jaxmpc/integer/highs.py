@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib.metadata
 import os
 import threading
 
@@ -17,6 +18,9 @@ import highspy
 import numpy as np
 
 from jaxmpc.integer.feasible import Chain
+from jaxmpc.programs.compilation import say
+
+ROUNDING = 1e-6  # by which answers of HiGHS may be off
 
 _FIRST = threading.Lock()
 
@@ -43,6 +47,21 @@ def _swallow_greeting() -> None:
         highspy.Highs()
 
 
+def contradiction(claim: float, known: float, what: str) -> str:
+    """Say on standard error that HiGHS claims what a known plan disproves; returns the line.
+
+    Args:
+        claim: bound that HiGHS calls proven, infinite where it finds nothing feasible.
+        known: objective that disproves it.
+        what: whose objective that is, such as ``a known plan``.
+    """
+    version = importlib.metadata.version("highspy")
+    found = f"a bound of {claim:.12g}" if np.isfinite(claim) else "that nothing is feasible"
+    line = f"HiGHS (highspy {version}) claims {found}, but {what} has {known:.12g}: its answer is dropped"
+    say(line)
+    return line
+
+
 class ReducedMilp:
     """min sum own_i(d_i) + theta over the whole moves that are still free; theta is bounded below by cuts.
 
@@ -60,6 +79,7 @@ class ReducedMilp:
         self.free = np.flatnonzero(upper > lower)
         self.base = float(sum(own[i, 0] for i in range(len(lower)))) / unit
         self.first_column = {}
+        self.forbidden: set[bytes] = set()
         highs = self.highs = _silent_highs()
         for option, value in (
             ("threads", 1),
@@ -192,6 +212,7 @@ class ReducedMilp:
 
     def forbid(self, point: np.ndarray) -> None:
         """No-good cut: at least one free move differs from `point`."""
+        self.forbidden.add(point.tobytes())
         index, value, right = [], [], 1.0
         for i in self.free:
             width = int(self.upper[i] - self.lower[i])
@@ -304,6 +325,7 @@ def solve_milp(
     *,
     gap: float = 1e-9,
     seconds: float | None = None,
+    known: np.ndarray | None = None,
 ) -> tuple[str, np.ndarray | None, float]:
     """Min cost'x subject to row_low <= A x <= row_high, low <= x <= high, x_i whole where `integer`.
 
@@ -314,10 +336,11 @@ def solve_milp(
         integer: ``"n"``, true for whole variables.
         gap: relative gap at which the search stops.
         seconds: time limit, None for none.
+        known: a feasible point, None for none; what it disproves is not believed.
 
     Returns:
-        ``(status, x, bound)``: ``optimal``, ``limit``, ``infeasible`` or ``failed``; the best point, None without one;
-        the proven lower bound of the cost.
+        ``(status, x, bound)``: ``optimal``, ``limit``, ``infeasible`` or ``failed``, which includes answers that contradict
+        themselves or what is known; the best point, None without one; the proven lower bound of the cost.
     """
     highs = _silent_highs()
     for option, value in (
@@ -345,10 +368,31 @@ def solve_milp(
     highs.passModel(lp)
     highs.run()
     state, info = highs.getModelStatus(), highs.getInfo()
+    worth = -np.inf if known is None else float(cost @ known)
     if state in (highspy.HighsModelStatus.kInfeasible, highspy.HighsModelStatus.kUnboundedOrInfeasible):
+        if known is not None:
+            contradiction(np.inf, worth, "a known point")
+            return "failed", None, -np.inf
         return "infeasible", None, np.inf
     found = np.array(highs.getSolution().col_value) if info.primal_solution_status == 2 else None
     bound = info.mip_dual_bound if np.any(integer) else info.objective_function_value
+    if found is not None:
+        reached = np.bincount(row, value * found[column], minlength=len(row_low))
+        slack = ROUNDING * (1.0 + np.bincount(row, np.abs(value * found[column]), minlength=len(row_low)))
+        broken = (reached < row_low - slack) | (reached > row_high + slack)
+        outside = (found < low - ROUNDING * (1.0 + np.abs(found))) | (
+            found > high + ROUNDING * (1.0 + np.abs(found))
+        )
+        between = integer & (np.abs(found - np.round(found)) > ROUNDING)
+        if broken.any() or outside.any() or between.any():
+            contradiction(float(bound), float(cost @ found), "its own point, which breaks rows or limits,")
+            return "failed", None, -np.inf
+        worth, whose = (
+            (worth, "a known point") if known is not None else (float(cost @ found), "its own point")
+        )
+        if bound > worth + ROUNDING * (1.0 + abs(worth)):
+            contradiction(float(bound), worth, whose)
+            return "failed", None, -np.inf
     if state == highspy.HighsModelStatus.kOptimal:
         return "optimal", found, float(bound)
     limits = (highspy.HighsModelStatus.kTimeLimit, highspy.HighsModelStatus.kIterationLimit)

@@ -13,6 +13,7 @@ whose bound stays below the incumbent can improve on it.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -147,6 +148,7 @@ def enumerate_below(
     cutoff: float,
     most: int | None,
     beam: int | None = None,
+    check_time: Callable[[], None] = lambda: None,
 ) -> tuple[np.ndarray, np.ndarray, float] | None:
     """All whole moves within limits whose bound is below `cutoff`: as a grid, or by breadth-first search over the blocks.
 
@@ -158,6 +160,7 @@ def enumerate_below(
         most: give up (return None) when more partial assignments than this are alive at once; None for as many as
             fit into memory.
         beam: keep only so many partial assignments of least bound, to find good moves rather than all.
+        check_time: called between two moves; may raise to end it.
 
     Returns:
         ``(moves "point integer", bounds "point", least)`` sorted by bound, `least` being the smallest bound of
@@ -173,6 +176,7 @@ def enumerate_below(
     position = np.zeros((1, len(chains)), dtype=int)
     least = np.inf
     for i, column in enumerate(model.order):
+        check_time()
         k, b = owner[int(column)]
         chain = chains[k]
         domain = np.arange(int(lower[column]), int(upper[column]) + 1)

@@ -98,7 +98,7 @@ class Constants:
             ) from None
         self.slope = np.asarray(qp.steep)[:, self.integer]  # of the envelope
         self.knot = np.arange(len(self.slope), dtype=float)[:, None]
-        self.scale = max(float(np.diag(curvature).max()), 1e-12)
+        self.scale = float(qp.unit)
         self.own_weight = 0.5 * (np.diag(curvature) - np.diag(hessian))[self.integer]
         # hard rows of the positions of the integer MVs, and these positions as sums of the whole moves
         self.position = self.mv * size.rows + self.block
@@ -113,8 +113,19 @@ class Constants:
     @functools.cached_property
     def chord_weight(self) -> Float[np.ndarray, " position"]:
         """Curvature of the positions that chords may pay (`tighten`), made when first needed."""
-        back = np.linalg.inv(self.reached)
-        return chord_weights(back.T @ self.schur @ back)
+        found = self.chords_within(None)
+        assert found is not None
+        return found
+
+    def chords_within(self, seconds: float | None) -> Float[np.ndarray, " position"] | None:
+        """`chord_weight` if it is known or made in so many seconds (None for no limit), else None."""
+        if "chord_weight" not in self.__dict__:
+            back = np.linalg.inv(self.reached)
+            found = chord_weights(back.T @ self.schur @ back, seconds)
+            if found is None:
+                return None
+            self.__dict__["chord_weight"] = found
+        return self.chord_weight
 
     def of_chords(self, price: np.ndarray, at: np.ndarray) -> tuple[float, np.ndarray]:
         """What prices of chords add to a lower bound with all curvature: its value and its gradient at moves.
