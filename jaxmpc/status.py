@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-OPTIMAL, LIMIT, INFEASIBLE, FAILED = 0, 1, 2, 3
-STATUS = ("optimal", "limit", "infeasible", "failed")
+OPTIMAL, LIMIT, INFEASIBLE, FAILED, UNPROVEN = 0, 1, 2, 3, 4
+STATUS = ("optimal", "limit", "infeasible", "failed", "unproven")
+
+OUT_OF_TIME = "the time limit was reached before the plan was proven to the gap that is asked for"
 
 FINISHERS = (None, "relaxation", "fixing", "enumeration", "highs", "branch-and-bound")
 

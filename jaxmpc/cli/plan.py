@@ -20,7 +20,7 @@ FINISHES = ("auto", "enumeration", "highs", "branch-and-bound")
     option("--out", "PLAN.json", "where to write (default: standard output)", Path),
     choice("--finish", FINISHES, "how integer moves are decided; each way alone is exact"),
     epilog="Exit status: 0 optimal, 2 bad input (nothing is written), 3 infeasible, 4 time limit reached "
-    "with a feasible plan, 1 anything else.",
+    "with a feasible plan, 1 anything else, such as a plan that is not proven for another reason.",
 )
 def plan(options: Options) -> int:
     """Solve one controller step from a case file (JSON, engineering units)."""
@@ -30,9 +30,11 @@ def plan(options: Options) -> int:
 
     case = load_case(options.case)
     from jaxmpc.controller.plan import solve_plan
+    from jaxmpc.programs.progress import shown
 
     given = {field.name: getattr(case, field.name) for field in dataclasses.fields(case)}
-    body = plan_to_dict(solve_plan(**given, finish=options.finish))
+    with shown():
+        body = plan_to_dict(solve_plan(**given, finish=options.finish))
     fields = (f" {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in body.items())
     text = "{\n" + ",\n".join(fields) + "\n}\n"  # one field per line
     status, objective = body["status"], body["objective"]
@@ -42,6 +44,8 @@ def plan(options: Options) -> int:
         write_atomically(options.out, text)
         said = f"jaxmpc: {status}, objective {objective}, gap {body['gap']}: {options.out}"
         print(said, file=sys.stderr)
+    if "reason" in body:
+        print(f"jaxmpc: {status}: {body['reason']}", file=sys.stderr)
     limit = cli.EXIT_OTHER if objective is None else cli.EXIT_LIMIT  # None: it came before any feasible plan
     known = {"optimal": cli.EXIT_OPTIMAL, "infeasible": cli.EXIT_INFEASIBLE, "limit": limit}
     return known.get(status, cli.EXIT_OTHER)

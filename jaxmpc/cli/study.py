@@ -205,9 +205,10 @@ def simulate(options: Options) -> int:
     check_folder("--out", options.out)
     import warnings
 
+    from jaxmpc.programs.progress import shown
     from studies.rerun import rerun
 
-    with warnings.catch_warnings(record=True) as caught:
+    with warnings.catch_warnings(record=True) as caught, shown():
         warnings.simplefilter("always", UserWarning)
         again = rerun(Path(store), int(number))
     for warning in caught:

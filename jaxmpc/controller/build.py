@@ -21,7 +21,7 @@ from jaxmpc.problem.condense import CondensedQp, Matrices, condense, matrices_of
 from jaxmpc.problem.layout import Layout, Size, layout_of, rung
 from jaxmpc.problem.memory import check_size
 from jaxmpc.problem.structure import Structure, check_match
-from jaxmpc.problem.tuning import Tuning, stack_tunings
+from jaxmpc.problem.tuning import Tuning, stack_tunings, within_values
 from jaxmpc.programs.lanes import Lanes, lanes_of
 
 AT_ONCE = 64  # lanes that are condensed together
@@ -96,6 +96,10 @@ class Scenarios:
         for k, model in enumerate(models):
             check_match(first, model, f"model[{k}]" if len(models) > 1 else "model")
         number = counts.pop() if counts else 1
+        if len({structure.integer_values for structure in structures}) > 1 and len(tunings) == 1:
+            tunings = list(tunings) * number
+        own = len(structures) > 1 and len(tunings) > 1
+        tunings = [within_values(structures[k if own else 0], t) for k, t in enumerate(tunings)]
         one_each = lambda values: list(values) * number if len(values) == 1 else list(values)  # noqa: E731
         pairs = {(s, m.samples) for s in set(structures) for m in models}
         most = max(sum(map(s.whole_blocks, s.integer_mvs)) for s in structures)
@@ -174,7 +178,9 @@ class Scenarios:
 
     def core(self, qps: Lanes[CondensedQp], constants: Sequence[Constants]) -> Lanes[Core]:
         """Everything that compiled programs know, shared where it is given once."""
-        tables = lanes_of([c.tables(self.integers) for c in constants]) if self.integers else _no_tables(qps)
+        restricted = any(s.has_gaps_or_dwell for s in self.structures)
+        made = [c.tables(self.integers, restricted) for c in constants]
+        tables = lanes_of(made) if self.integers else _no_tables(qps)
         tunings, coefficients = self.tunings, self._coefficients()
         parts = [
             self.layouts(),

@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from jaxmpc.check import LARGEST, sound
+from jaxmpc.check import LARGEST, is_count, sound
 from jaxmpc.decoding import decode
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
@@ -28,6 +28,7 @@ from jaxmpc.problem.instance import DRIFT
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.problem.tuning import Tuning, make_tuning
+from jaxmpc.problem.values import neighbours
 from jaxmpc.relaxed.gap import check_gap, check_time_limit
 
 DEFAULT_GAP = 1e-6
@@ -49,6 +50,8 @@ class Case:
     setpoint: np.ndarray  # ``"horizon cv"`` [CV unit]
     # ``"block mv"``, where the search may start [MV unit per sample], or ``None``
     previous_moves: np.ndarray | None = None
+    # per MV, samples since its last move, None for long ago; or ``None``
+    samples_since_move: tuple[int | None, ...] | None = None
     time_limit: float | None = None  # of the solve [s], or ``None``
     gap: float = DEFAULT_GAP  # relative gap at which the plan counts as optimal
 
@@ -67,6 +70,8 @@ class _StructureFields(msgspec.Struct, forbid_unknown_fields=True):
     blocking: str
     blocks: Any = []  # lengths, or an object of them by MV
     integer_step: dict[str, Any] = {}
+    integer_values: dict[str, Any] = {}
+    dwell: dict[str, Any] = {}
     integer_horizon: int | dict[str, Any] = {}
 
 
@@ -98,6 +103,7 @@ class _CaseFields(msgspec.Struct, forbid_unknown_fields=True):
     free_response: list[list[float]]
     setpoint: list[list[float]]
     previous_moves: list[list[float]] | None = None
+    samples_since_move: list[int | None] | None = None
     limits: _LimitFields | None = None
 
 
@@ -116,6 +122,7 @@ _PLAN = (
 _UNIT = {
     "model.dt": "s",
     "model.coefficients": "CV unit per MV unit",
+    "samples_since_move": "samples",
     "limits.time_s": "s",
     "limits.gap": "relative",
     **{f"structure.{key}": field.unit for key, field in declared(Structure).items()},
@@ -166,6 +173,7 @@ def make_case(body: Any) -> Case:
         structure=structure,
         tuning=make_tuning(structure, **{key: getattr(fields.tuning, key) for key in _IN_STEP}),
         **{key: step_array(key, getattr(fields, key), structure) for key in _ARRAYS},
+        samples_since_move=checked_since(structure, fields.samples_since_move),
         time_limit=check_time_limit("limits.time_s", limits.time_s),
         gap=check_gap("limits.gap", limits.gap),
     )
@@ -196,14 +204,26 @@ def case_to_dict(case: Case) -> dict[str, Any]:
         "structure": {
             **{key: getattr(structure, key) for key in _PLAIN_STRUCTURE},
             "blocks": _blocks(structure),
-            "integer_step": {structure.mv_names[i]: structure.integer_step[i] for i in structure.integer_mvs},
+            "integer_step": _by_name(structure, structure.integer_step),
+            "integer_values": _by_name(structure, structure.integer_values),
+            "dwell": _by_name(structure, structure.dwell),
             **({"integer_horizon": horizons} if horizons else {}),
         },
         "tuning": _plain(tuning),
         **{key: np.asarray(getattr(case, key)).tolist() for key in _ARRAYS if getattr(case, key) is not None},
         "limits": {"time_s": case.time_limit, "gap": case.gap},
     }
+    for key in ("integer_values", "dwell"):  # what few cases have
+        if not body["structure"][key]:
+            del body["structure"][key]
+    if case.samples_since_move is not None:
+        body["samples_since_move"] = list(case.samples_since_move)
     return body
+
+
+def _by_name(structure: Structure, values: tuple) -> dict[str, Any]:
+    """Those of the MVs that have one."""
+    return {name: v for name, v in zip(structure.mv_names, values, strict=False) if v is not None}
 
 
 def dump_case(case: Case, path: str | Path) -> Path:
@@ -214,11 +234,11 @@ def dump_case(case: Case, path: str | Path) -> Path:
 def plan_to_dict(plan: Any) -> dict[str, Any]:
     """The content of a plan file: the fields of a `Plan`, with null where a number is not finite.
 
-    `integer_until` is among them where an integer horizon leaves moves relaxed.
+    The reason is there only where the plan is not optimal, `integer_until` where an integer horizon leaves moves relaxed.
     """
-    until = getattr(plan, "integer_until", None)
+    some = {name: _plain(getattr(plan, name, None)) for name in ("reason", "integer_until")}
     body = {name: _plain(getattr(plan, name)) for name in _PLAN}
-    return body if until is None else body | {"integer_until": _plain(until)}
+    return body | {name: value for name, value in some.items() if value is not None}
 
 
 def _plain(value: Any) -> Any:
@@ -294,14 +314,21 @@ def _given_horizon(given: int | dict[str, Any], integer: dict[str, Any], names: 
 
 
 def _structure(fields: _StructureFields, model: StepResponseModel) -> Structure:
-    steps: list[Any] = [None] * len(model.mv_names)
-    for name, step in fields.integer_step.items():
-        path = f"structure.integer_step.{name}"
-        if name not in model.mv_names:
-            raise InputError(path, step, f"one of the MV names {', '.join(model.mv_names)}")
-        if step is None:
-            raise InputError(path, step, "a positive step [MV unit]; leave a continuous MV out")
-        steps[model.mv_names.index(name)] = step
+    of_mvs = {
+        "integer_step": (None, "a positive step [MV unit]; leave a continuous MV out"),
+        "integer_values": (None, "a list of values [MV unit]; leave a continuous MV out"),
+        "dwell": (1, "a whole number of samples; leave an MV without dwell out"),
+    }
+    per_mv: dict[str, Any] = {}
+    for key, (absent, expected) in of_mvs.items():
+        per_mv[key] = [absent] * len(model.mv_names)
+        for name, value in getattr(fields, key).items():
+            path = f"structure.{key}.{name}"
+            if name not in model.mv_names:
+                raise InputError(path, value, f"one of the MV names {', '.join(model.mv_names)}")
+            if value is None:
+                raise InputError(path, value, expected)
+            per_mv[key][model.mv_names.index(name)] = value
     for key in ("prediction_horizon", "control_horizon"):
         if getattr(fields, key) > LONGEST_HORIZON:
             raise InputError(f"structure.{key}", getattr(fields, key), f"at most {LONGEST_HORIZON} samples")
@@ -314,8 +341,12 @@ def _structure(fields: _StructureFields, model: StepResponseModel) -> Structure:
         first_penalised=fields.first_penalised,
         blocks=_given_blocks(fields.blocks, model.mv_names),
         blocking=fields.blocking,  # type: ignore[arg-type]  # `Structure` checks it
-        integer_step=tuple(steps),
-        integer_horizon=_given_horizon(fields.integer_horizon, fields.integer_step, model.mv_names),
+        integer_step=tuple(per_mv["integer_step"]),
+        integer_values=tuple(per_mv["integer_values"]),
+        dwell=tuple(per_mv["dwell"]),
+        integer_horizon=_given_horizon(
+            fields.integer_horizon, {**fields.integer_step, **fields.integer_values}, model.mv_names
+        ),
     )
 
 
@@ -344,11 +375,37 @@ def step_array(path: str, given: Any, structure: Structure) -> Any:
 
 
 def check_position(structure: Structure, tuning: Tuning, mv_now: np.ndarray) -> None:
-    """Refuse MVs outside their limits: the closed-loop controller recovers, a single step cannot."""
+    """Refuse MVs outside their limits or off their lists: the closed-loop controller recovers, a single step cannot."""
     low, high = np.asarray(tuning.mv_low), np.asarray(tuning.mv_high)
     for i, name in enumerate(structure.mv_names):
         now = float(mv_now[i])
-        drift = DRIFT * (structure.integer_step[i] or max(1.0, abs(now)))  # what MIP solvers leave over
+        drift = DRIFT * (structure.steps[i] or max(1.0, abs(now)))  # what MIP solvers leave over
         if not low[i] - drift <= now <= high[i] + drift:
             expected = f"mv_low[{i}] = {low[i]:g} to mv_high[{i}] = {high[i]:g} [MV unit] for {name}"
             raise InputError(f"mv_now[{i}]", now, expected)
+    check_listed(structure, mv_now)
+
+
+def check_listed(structure: Structure, mv_now: np.ndarray) -> None:
+    """Refuse MVs that are not on one of their allowed values."""
+    for i, (name, values) in enumerate(zip(structure.mv_names, structure.integer_values, strict=False)):
+        now, drift = float(mv_now[i]), DRIFT * (structure.steps[i] or 1.0)
+        if values is not None and min(abs(now - value) for value in values) > drift:
+            near = " or ".join(f"{value:g}" for value in neighbours(values, now))
+            expected = f"a value of structure.integer_values.{name}, the nearest being {near} [MV unit]"
+            raise InputError(f"mv_now[{i}]", now, expected)
+
+
+def checked_since(structure: Structure, given: Any) -> tuple[int | None, ...] | None:
+    """Samples since the last move of every MV, None for long ago; None as it is."""
+    if given is None:
+        return None
+    names = ", ".join(structure.mv_names)
+    if np.ndim(given) != 1 or len(given) != structure.mv_count:
+        expected = f"{structure.mv_count} whole numbers [samples], null (None) for long ago, for {names}"
+        raise InputError("samples_since_move", given, expected)
+    for i, samples in enumerate(given):
+        if samples is not None and not is_count(samples):
+            expected = "a whole number of samples, 1 or more, or null (None) for long ago"
+            raise InputError(f"samples_since_move[{i}]", samples, expected)
+    return tuple(None if samples is None else int(samples) for samples in given)

@@ -24,18 +24,21 @@ from jaxmpc.controller.build import Scenarios
 from jaxmpc.controller.core import ControllerState, Core, Moment, StepInfo
 from jaxmpc.controller.sample import Sample, checked, checked_start
 from jaxmpc.errors import InputError
+from jaxmpc.integer.actuators import Actuator, actuators_of, samples_since
 from jaxmpc.integer.finish import finish_steps
-from jaxmpc.integer.host_search import SearchResult
-from jaxmpc.integer.relaxer import Relaxations, Relaxer
-from jaxmpc.integer.solve import FINISHES, UNINTERRUPTED
+from jaxmpc.integer.host_search import Known, SearchResult
+from jaxmpc.integer.relaxer import Relaxations, Relaxer, pace_of
+from jaxmpc.integer.search import Decision
+from jaxmpc.integer.solve import FINISHES
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
-from jaxmpc.programs.clock import Clock
+from jaxmpc.programs.clock import Clock, in_time
 from jaxmpc.programs.compilation import compiling_for
 from jaxmpc.programs.lanes import Lanes
+from jaxmpc.programs.pace import Pace
 from jaxmpc.programs.packing import PackedCall, flattened, rebuilt
-from jaxmpc.relaxed.gap import check_gap, check_time_limit, relative_gap
+from jaxmpc.relaxed.gap import FINEST, check_gap, check_time_limit, relative_gap
 
 KEPT = 8  # combinations of CVs that are switched off, with what their searches need
 
@@ -82,6 +85,7 @@ class Batch:
     gap: float
     time_limit: float | None
     finish: str
+    pace: Pace  # of compiled steps as far as it is known
     decided: bool = False  # whether a step has been
 
     def __post_init__(self):
@@ -94,7 +98,7 @@ class Batch:
         if self.count == len(index) and (index == np.arange(self.count)).all():
             return self
         relaxers = self.relaxers.part(index)
-        own = self.gap, self.time_limit, self.finish, self.decided
+        own = self.gap, self.time_limit, self.finish, self.pace, self.decided
         return Batch(relaxers.scenarios, self.cores.take(index), relaxers, *own)
 
     def repeated(self, count: int) -> Batch:
@@ -103,8 +107,19 @@ class Batch:
 
     @property
     def searching(self) -> bool:
-        """Whether whole moves may be searched for in a compiled call, which nothing interrupts."""
-        return in_one_call(self.finish, self.time_limit)
+        """Whether whole moves may be searched for in a compiled call."""
+        return self.finish == "auto"
+
+    @property
+    def most(self) -> Float[np.ndarray, " scenario"]:
+        """Newton steps of a compiled step that fit the time limit, infinite where there are no integer MVs or no limit."""
+        return np.where(self.integer, self.pace.steps_within(self.pace.before_tail(self.time_limit)), np.inf)
+
+    @property
+    def settings(self) -> Float[np.ndarray, "scenario 3"]:
+        """Of `considered`."""
+        shared = np.tile([max(self.gap, FINEST), float(self.searching)], (self.count, 1))
+        return np.concatenate([shared, self.most[:, None]], axis=1)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but forms of trees, which are of no use outside this process."""
@@ -142,10 +157,10 @@ class Batch:
         """`step` of a checked sample."""
         clock = Clock()
         sample = sample._replace(setpoint=self.over_horizon(sample.setpoint))
-        settings = np.tile([self.gap, float(self.searching)], (self.count, 1))
-        given = jax.tree.map(np.asarray, (state, sample, settings))
-        with compiling_for(str(self.size)):
+        given = jax.tree.map(np.asarray, (state, sample, self.settings))
+        with compiling_for(str(self.size)), in_time(self.time_limit):
             state, info, moment = self._step(self.cores, self.flat, *given)
+        self.pace.took(clock.seconds, int(moment.decision.steps.sum()), self.count)
         seconds = np.full(self.count, clock.seconds / self.count)
         fields: dict[str, Any] = {"solve_time": seconds}
         left = np.flatnonzero(~moment.decision.closed & self.integer)
@@ -157,6 +172,8 @@ class Batch:
             leaves, form = self.flat
             state, moves = jax.tree.map(np.asarray, _carry_out(leaves, moment, x, good, form))
             fields |= dict(move=moves[:, 0], mv=state.mv, moves=moves)
+            if self.time_limit is not None and self.count == 1 and fields["status"][0] == codes.LIMIT:
+                self.pace.ended(clock.seconds - self.time_limit)
         self.decided = True
         return state, dataclasses.replace(info, **fields)
 
@@ -190,7 +207,7 @@ class Batch:
         structures = [self.scenarios.structures[i] for i in which]
         for structure in dict.fromkeys(structures):
             own = np.array([its == structure for its in structures])
-            results |= zip(which[own], self._finish_some(moment, which[own], spent[own].mean()), strict=True)
+            results |= zip(which[own], self._finish_some(moment, which[own], spent[own]), strict=True)
         for i, result in results.items():
             good[i] = result.x is not None
             if result.x is not None:
@@ -199,28 +216,32 @@ class Batch:
         said = [_said(results[i], float(moment.unit[i])) for i in which]
         return x, good, {name: np.array([one[name] for one in said]) for name in said[0]}
 
-    def _finish_some(self, moment: Moment, index: np.ndarray, spent: float) -> list[SearchResult]:
+    def _finish_some(self, moment: Moment, index: np.ndarray, spent: np.ndarray) -> list[SearchResult]:
         """Of scenarios of one structure."""
         own: Moment = jax.tree.map(lambda leaf: np.asarray(leaf)[index], moment)
+        structure = self.scenarios.structures[index[0]]
         relaxers = self.relaxers.without(np.asarray(moment.state.sensors.off))
         try:
-            with compiling_for(str(self.size)):
+            with compiling_for(str(self.size)), in_time(self.time_limit):
                 return finish_steps(
                     functools.cache(lambda envelope: relaxers(envelope).part(index)),
                     own.instance,
                     Relaxations.of(own.decision.root),
                     previous_moves=own.state.plan,  # pyright: ignore[reportArgumentType]
                     gap=self.gap,
-                    time_limit=self.time_limit,
+                    time_limit=self.pace.before_tail(self.time_limit),
                     finish=self.finish,
-                    spent=float(spent),
+                    actuators=_actuators(structure, own) if structure.has_gaps_or_dwell else (),
+                    recover=True,
+                    spent=spent,
+                    known=None if self.time_limit is None else known_of(own.decision),
                 )
         except InputError:  # moves without limits have ranges that follow from the measurements
             if not self.decided:
                 raise
-            return [SearchResult(None, np.inf, -np.inf, codes.FAILED, None, 0, seconds=float(spent))] * len(
-                index
-            )
+            return [
+                SearchResult(None, np.inf, -np.inf, codes.FAILED, None, 0, seconds=float(s)) for s in spent
+            ]
 
 
 class Controllers(Batch):
@@ -258,7 +279,21 @@ class Controllers(Batch):
             qps = scenarios.problems(1)
         constants = scenarios.constants(qps) if scenarios.integers else []
         relaxers = Relaxers(scenarios, {1: Relaxer(qps, constants)} if scenarios.integers else {})
-        super().__init__(scenarios, scenarios.core(qps, constants), relaxers, *options)
+        cores, pace = scenarios.core(qps, constants), pace_of(scenarios.size)
+        super().__init__(scenarios, cores, relaxers, *options, pace)
+
+
+def _actuators(structure: Structure, moment: Moment) -> list[list[Actuator]]:
+    """What the integer MVs of every lane must keep besides limits and hard rows."""
+    state, found = moment.state, []
+    for k, past in enumerate(np.asarray(state.past_moves)):
+        now, since = np.array(state.mv[k]), samples_since(structure, past)
+        if moment.correction is not None:
+            back = np.asarray(moment.correction[k])
+            now += back
+            since = np.where(samples_since(structure, back[None]) == 1, 0, since)  # it is a move, too
+        found.append(actuators_of(structure, now, since, np.asarray(state.manual[k])))
+    return found
 
 
 def check_finish(finish: str) -> str:
@@ -268,9 +303,11 @@ def check_finish(finish: str) -> str:
     return finish
 
 
-def in_one_call(finish: str, time_limit: float | None) -> bool:
-    """Whether whole moves may be searched for in a compiled call, which nothing interrupts."""
-    return finish == "auto" and (time_limit is None or time_limit >= UNINTERRUPTED)
+def known_of(decision: Decision) -> list[Known]:
+    """What a compiled search has found for its scenarios, for moves of one step."""
+    fields = decision.x, decision.value, np.maximum(decision.bound, 0.0)
+    fields = (np.asarray(values) for values in fields)
+    return [Known(x, float(value), float(bound)) for x, value, bound in zip(*fields, strict=True)]
 
 
 def _said(result: SearchResult, unit: float) -> dict[str, Any]:
@@ -300,11 +337,11 @@ def considered(cores: Lanes[Core], state: ControllerState, sample: Sample, setti
     """A sample of all scenarios, decided as far as a compiled program decides it.
 
     Args:
-        settings: ``"scenario 2"``, relative gap, and whether whole moves may be searched for (1 or 0).
+        settings: ``"scenario 3"``, relative gap, whether whole moves may be searched for (1 or 0), and Newton steps at most.
     """
 
     def one(core: Core, state, sample, settings):
-        return core.consider(state, sample, settings[0], settings[1] > 0)
+        return core.consider(state, sample, settings[0], settings[1] > 0, settings[2])
 
     return cores.vmap(one, state, sample, settings)
 

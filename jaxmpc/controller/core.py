@@ -25,7 +25,7 @@ from jaxmpc.integer.search import Decision, decide
 from jaxmpc.integer.tables import Tables
 from jaxmpc.model.step_response import advance_free_response, shift_free_response
 from jaxmpc.problem.condense import CondensedQp, Matrices, condense, matrices_of
-from jaxmpc.problem.instance import QpInstance, make_instance
+from jaxmpc.problem.instance import DRIFT, QpInstance, make_instance
 from jaxmpc.problem.layout import Layout, Size
 from jaxmpc.problem.tuning import Tuning
 from jaxmpc.relaxed.gap import relative_gap
@@ -59,7 +59,7 @@ class StepInfo(eqx.Module):
         moves: planned block moves [MV unit].
         status: code of `jaxmpc.status`.
         fallback: the MVs were held because there was no plan.
-        recovering: an MV was outside its limits and is being brought back.
+        recovering: an MV was outside its limits or between its allowed values and is being brought back.
         quality: of the measurements, codes of `jaxmpc.controller.measurement.QUALITY`: 0 good, all others were left out.
         off: CVs that are switched off, because too many measurements in a row were left out.
         objective, bound, gap: value of the plan (6.6), proven bound, relative gap; not a number without a plan.
@@ -93,7 +93,10 @@ class Moment(NamedTuple):
     decision: Decision  # what the search found
     scale: Float[Array, " n"]  # MV units per unit of x
     unit: Float[Array, ""]  # of the objective, see `gap.closes`
-    recovering: Bool[Array, ""]  # whether an MV is outside its limits
+    # whether an MV is outside its limits or between its allowed values
+    recovering: Bool[Array, ""]
+    # to the nearest allowed values, made together with the first move; None where no MV has a list [MV unit]
+    correction: Float[Array, " mv"] | None = None
 
     @property
     def good(self) -> Bool[Array, ""]:
@@ -258,20 +261,41 @@ class Core(eqx.Module):
         form: dict[str, Any] = dict(envelope=self.qp.steep.shape[0], has_limits=self.qp.has_limits)
         return condense(self.layout, self.size, tuning, matrices, **form)
 
-    def consider(self, state: ControllerState, sample: Sample, gap, search=True) -> Moment:
+    def consider(self, state: ControllerState, sample: Sample, gap, search=True, most=np.inf) -> Moment:
         """Observe, pose and decide a sample.
 
         Args:
             search: whether whole moves may be searched for here; otherwise none but the relaxation is solved.
+            most: Newton steps after which it gives up.
         """
         state, free_response = self.observe(state, sample.cv, sample.mv, sample.manual)
         tuning = without(self.limits_now(state), state.sensors.off)
         qp, tables = self.condensed_now(state.sensors.off)
-        instance = self.instance(state, qp, tuning, free_response, sample.setpoint)
+        correction, standing = self.correction(state), state
+        if correction is not None:
+            free_response += advance_free_response(
+                jnp.zeros_like(state.future), self.coefficients, correction
+            ).T
+            standing = eqx.tree_at(lambda s: s.mv, state, state.mv + correction)
+        instance = self.instance(standing, qp, tuning, free_response, sample.setpoint)
         tables = eqx.tree_at(lambda t: t.known, tables, tables.known & search)
-        decision = decide(qp, tables, instance, state.warm, gap)
+        decision = decide(qp, tables, instance, state.warm, gap, most)
         recovering = outside_limits(tuning, state.mv)
-        return Moment(state, free_response, instance, decision, qp.scale, tables.scale, recovering)
+        if correction is not None:
+            recovering |= jnp.any(correction != 0.0)
+        return Moment(
+            state, free_response, instance, decision, qp.scale, tables.scale, recovering, correction
+        )
+
+    def correction(self, state: ControllerState) -> Float[Array, " mv"] | None:
+        """The moves to the nearest allowed values, zero in manual and for float drift; None where no MV has a list."""
+        values = self.layout.values
+        if values is None:
+            return None
+        away = values - state.mv[:, None]
+        least = jnp.take_along_axis(away, jnp.argmin(jnp.abs(away), axis=1)[:, None], axis=1)[:, 0]
+        needed = jnp.isfinite(least) & (jnp.abs(least) > DRIFT * self.layout.step) & ~state.manual
+        return jnp.where(needed, least, 0.0)
 
     def carry_out(
         self, moment: Moment, x: Float[Array, " n"], good: Bool[Array, ""]
@@ -284,6 +308,8 @@ class Core(eqx.Module):
         state, warm = moment.state, moment.decision.root.warm
         planned = (x * moment.scale).reshape(self.size.mvs, -1).T
         first = self.first_move(moment.scale, moment.instance, planned[0])
+        if moment.correction is not None:
+            first += moment.correction
         moves = jnp.where(good, planned.at[0].set(first), 0.0)
         warm = jax.tree.map(lambda new, old: jnp.where(good, new, old), warm, state.warm)
         return self.remember(state, moves, warm), moves
@@ -318,7 +344,13 @@ class Core(eqx.Module):
         first, row = mv * self.size.blocks, mv * self.size.rows
         low = jnp.maximum(instance.lower[first], instance.row_low[row] / held)
         high = jnp.minimum(instance.upper[first], instance.row_high[row] / held)
-        return jnp.clip(move / scale[first], low, high) * scale[first]
+        wanted = move / scale[first]
+        kept = jnp.clip(wanted, low, high)
+        if (
+            self.tables.complete is not None
+        ):  # whole moves that were decided on the host may have other limits
+            kept = jnp.where(self.layout.integer, wanted, kept)
+        return kept * scale[first]
 
     def conclude(self, moment: Moment) -> tuple[ControllerState, StepInfo]:
         """Carry out what the compiled program decided; the MVs are held where it left something open."""

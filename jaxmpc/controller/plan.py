@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -17,28 +18,31 @@ from numpy.typing import ArrayLike
 
 from jaxmpc import html
 from jaxmpc import status as codes
-from jaxmpc.controller.case import check_position, step_array
-from jaxmpc.controller.controller import Controllers, check_finish, in_one_call, one_lane
+from jaxmpc.controller.case import check_listed, check_position, checked_since, step_array
+from jaxmpc.controller.controller import Controllers, check_finish, known_of, one_lane
 from jaxmpc.controller.core import Core
 from jaxmpc.controller.sample import require_double_precision
+from jaxmpc.integer.actuators import LONG_AGO, Actuator, actuators_of, samples_since
+from jaxmpc.integer.feasible import held_within
 from jaxmpc.integer.finish import finish_steps
-from jaxmpc.integer.host_search import SearchResult
+from jaxmpc.integer.host_search import SearchResult, no_whole_moves
 from jaxmpc.integer.relaxer import Relaxations
 from jaxmpc.integer.search import Decision, Relaxed, decide
 from jaxmpc.integer.solve import continuous_feasible
 from jaxmpc.model.step_response import StepResponseModel
-from jaxmpc.problem.blocking import counts_by_mv, moves_of_samples, moves_per_block
+from jaxmpc.problem.blocking import counts_by_mv, moves_of_samples
 from jaxmpc.problem.condense import dynamic_matrix
 from jaxmpc.problem.instance import QpInstance, make_instance
-from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
-from jaxmpc.programs.clock import Clock
+from jaxmpc.programs.clock import Clock, in_time
 from jaxmpc.programs.compilation import compiling_for
 from jaxmpc.programs.lanes import Lanes
 from jaxmpc.programs.packing import PackedCall
 from jaxmpc.relaxed.gap import check_gap, check_time_limit, closes, relative_gap
-from jaxmpc.relaxed.newton import WarmStart
+from jaxmpc.relaxed.newton import MOST_STEPS, WarmStart
+
+ROUNDED = "rounding leaves objective and bound farther apart than the gap that is asked for"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +50,8 @@ class Plan:
     """A solved controller step, in engineering units.
 
     Attributes:
-        status: ``optimal``, ``limit`` (feasible, not proven within the gap), ``infeasible`` or ``failed``.
+        status: ``optimal``, ``limit`` (the time limit came before the proof), ``unproven`` (something else did, as `reason`
+            says), ``infeasible`` or ``failed``.
         objective: (6.6) with all constants; None without a plan.
         bound: proven lower bound of the objective.
         gap: relative gap between the two.
@@ -58,6 +63,7 @@ class Plan:
         nodes: relaxations solved in the search.
         solve_time_s: wall time of the solve without compilation [s].
         finished_by: which path closed the problem, None if none did.
+        reason: a sentence that says why the plan is not optimal, None where it is.
         warm: prices of the root relaxation, a start for the next sample.
         integer_until: under an integer horizon, the samples from the first on in which the moves of each MV are whole (0 for
             a continuous one): later moves are relaxed, and so are objective and bound. None where no MV has relaxed ones.
@@ -75,6 +81,7 @@ class Plan:
     nodes: int
     solve_time_s: float
     finished_by: str | None
+    reason: str | None = None
     warm: WarmStart | None = None
     integer_until: Int[np.ndarray, " mv"] | None = None
 
@@ -99,7 +106,7 @@ def _one_posed(
         recover=settings[2] > 0,
     )
     tables = eqx.tree_at(lambda t: t.known, core.tables, core.tables.known & (settings[1] > 0))
-    return instance, decide(core.qp, tables, instance, start, settings[0])
+    return instance, decide(core.qp, tables, instance, start, settings[0], settings[3])
 
 
 def _posed(cores: Lanes[Core], *given) -> tuple[QpInstance, Decision]:
@@ -133,6 +140,7 @@ class Planner:
         setpoint: Float[ArrayLike, "horizon cv"],
         previous_moves: Float[ArrayLike, "block mv"] | None = None,
         past_moves: Float[ArrayLike, "window mv"] | None = None,
+        samples_since_move: Sequence[int | None] | None = None,
         recover: bool = False,
         warm: WarmStart | None = None,
         time_limit: float | None = None,
@@ -142,7 +150,7 @@ class Planner:
         """Solve one step; arguments as in `solve_plan`.
 
         Args:
-            past_moves: moves of the mean-move window, ``"window mv"`` oldest first, or None.
+            past_moves: moves of the mean-move window, ``"window mv"`` oldest first, or None; the dwell sees them, too.
             recover: let MVs outside their limits return the shortest way.
             warm: `Plan.warm` of a neighbouring step; ignored where its size does not fit.
         """
@@ -151,6 +159,7 @@ class Planner:
         gap, time_limit = check_gap("gap", gap), check_time_limit("time_limit", time_limit)
         as_array = lambda v: np.asarray(v, dtype=np.float64)  # noqa: E731
         free_response, setpoint, mv_now = as_array(free_response), as_array(setpoint), as_array(mv_now)
+        check_listed(self.structure, mv_now)
         past: np.ndarray = self._no_past.copy()
         if past_moves is not None:
             moves = as_array(past_moves)[-past.shape[1] :]
@@ -161,18 +170,42 @@ class Planner:
             start = jax.tree.map(lambda leaf: np.asarray(leaf)[None], warm)
         whole = self.controllers.over_horizon
         known = whole(free_response[None]), whole(setpoint[None]), mv_now[None], as_array(last_move)[None]
-        settings = np.array([[gap, float(in_one_call(finish, time_limit)), float(recover)]])
         clock, own = Clock(), self.controllers
-        with compiling_for(str(own.size)):
-            instance, found = self._pose(own.cores, own.flat, *known, past, start, settings)
-        result = self._decided(instance, found, previous_moves, gap, time_limit, finish, clock.seconds)
-        return self._plan(one_lane(instance), result, mv_now, free_response, setpoint, gap, clock)
+        until = own.pace.before_tail(time_limit)
+        left = lambda: None if until is None else until - clock.seconds  # noqa: E731
+        with compiling_for(str(own.size)), in_time(time_limit):
+            while True:
+                most, one = own.pace.steps_within(left()), Clock()
+                settings = np.array([[gap, float(finish == "auto"), float(recover), most]])
+                instance, found = self._pose(own.cores, own.flat, *known, past, start, settings)
+                steps, root = int(found.steps[0]), found.root
+                own.pace.took(one.seconds, steps)
+                if root.steps[0] < most or root.status[0] == codes.OPTIMAL or not own.pace.fits(left()):
+                    break
+                start = root.warm  # there was more time than it was given
+            actuators = self._actuators(mv_now, past[0], known[3], samples_since_move)
+            line = gap, until, finish, clock.seconds
+            result = self._decided(instance, found, previous_moves, actuators, recover, *line)
+            plan = self._plan(one_lane(instance), result, mv_now, free_response, setpoint, gap, clock)
+        if time_limit is not None and result.status == codes.LIMIT:
+            own.pace.ended(clock.seconds - time_limit)
+        return plan
+
+    def _actuators(self, mv_now, past, last_move, samples_since_move) -> list[list[Actuator]]:
+        """What lists and a dwell leave the integer MVs, one lane; none where there are neither."""
+        if not self.structure.has_gaps_or_dwell:
+            return []
+        moves = np.concatenate([past[:-1], np.where(last_move == 0.0, past[-1:], last_move)])
+        told = _told(self.structure, samples_since_move)
+        return [actuators_of(self.structure, mv_now, np.minimum(samples_since(self.structure, moves), told))]
 
     def _decided(
         self,
         instance: QpInstance,
         decision: Decision,
         previous_moves,
+        actuators: list[list[Actuator]],
+        recover: bool,
         gap,
         time_limit,
         finish: str,
@@ -181,7 +214,8 @@ class Planner:
         """How the step ended, by the compiled program or on the host."""
         found = one_lane(decision)
         if not self.structure.integer_mvs:
-            return self._relaxed(one_lane(instance), found.root, gap)
+            stopped = time_limit is not None and found.root.steps < MOST_STEPS
+            return self._relaxed(one_lane(instance), found.root, gap, stopped)
         start = found.root.warm
         if found.closed and finish == "auto":
             by = codes.FINISHERS[int(found.finished_by)]
@@ -198,21 +232,28 @@ class Planner:
             gap=gap,
             time_limit=time_limit,
             finish=finish,
+            actuators=actuators,
+            recover=recover,
             spent=spent,
+            known=None if time_limit is None else known_of(decision),
         )
         return result
 
-    def _relaxed(self, instance: QpInstance, root: Relaxed, gap: float) -> SearchResult:
-        """The problem without integers: one relaxation."""
+    def _relaxed(self, instance: QpInstance, root: Relaxed, gap: float, stopped: bool) -> SearchResult:
+        """The problem without integers: one relaxation, which the time limit may have stopped."""
         if not continuous_feasible(self.structure, self.controllers.size, instance):
-            return SearchResult(None, np.inf, np.inf, codes.INFEASIBLE, None, 0)
+            return no_whole_moves()
         if not np.isfinite(root.warm.x).all():
-            return SearchResult(None, np.inf, -np.inf, codes.FAILED, None, 1)
+            why = "the relaxation was not solved: its numbers are not finite"
+            return SearchResult(None, np.inf, -np.inf, codes.FAILED, None, 1, reason=why)
         value = float(root.objective)
         bound = min(max(float(root.bound), 0.0), value)
-        closed = closes(value, bound, self._unit, gap)
-        status, by = (codes.OPTIMAL, "relaxation") if closed else (codes.LIMIT, None)
-        return SearchResult(np.asarray(root.warm.x), value, bound, status, by, 1, root.warm)
+        x = np.asarray(root.warm.x)
+        if closes(value, bound, self._unit, gap):
+            return SearchResult(x, value, bound, codes.OPTIMAL, "relaxation", 1, root.warm)
+        if stopped:
+            return SearchResult(x, value, bound, codes.LIMIT, None, 1, root.warm, reason=codes.OUT_OF_TIME)
+        return SearchResult(x, value, bound, codes.UNPROVEN, None, 1, root.warm, reason=ROUNDED)
 
     @functools.cached_property
     def _unit(self) -> float:
@@ -224,18 +265,21 @@ class Planner:
     ) -> Plan:
         if result.x is None:
             name, took = codes.STATUS[result.status], clock.seconds
-            none = Plan(name, None, None, None, None, None, None, None, None, result.nodes, took, None)
+            nothing: Any = (None,) * 8
+            none = Plan(
+                name, *nothing, nodes=result.nodes, solve_time_s=took, finished_by=None, reason=result.reason
+            )
             return dataclasses.replace(none, integer_until=self._integer_until)
         core, size = self.controllers.cores.shared, self.controllers.size
         x = np.array(result.x)
         x = np.where(np.asarray(core.qp.whole), np.round(x), x)
-        x = _repair(self.structure, size, instance, x)
+        x = held_within(self.structure, size, instance, x)  # solver tolerance is taken out
         moves = (x * np.asarray(core.qp.scale)).reshape(size.mvs, -1).T[: self.structure.block_count]
         objective, cv, eps = self.objective(moves, free_response, setpoint)
         bound = min(result.bound, objective)
-        state = result.status
+        state, reason = result.status, result.reason
         if state == codes.OPTIMAL and not closes(objective, bound, self._unit, gap):
-            state = codes.LIMIT
+            state, reason = codes.UNPROVEN, ROUNDED
         return Plan(
             status=codes.STATUS[state],
             objective=objective,
@@ -249,6 +293,7 @@ class Planner:
             nodes=result.nodes,
             solve_time_s=clock.seconds,
             finished_by=result.finished_by if state == codes.OPTIMAL else None,
+            reason=reason,
             warm=result.root,
             integer_until=self._integer_until,
         )
@@ -278,20 +323,9 @@ class Planner:
         return float(value), cv, (eps_high, eps_low)
 
 
-def _repair(structure: Structure, size: Size, instance: QpInstance, x: np.ndarray) -> np.ndarray:
-    """Take solver tolerance out of the continuous moves: clip moves, then positions, block after block."""
-    by_mv = lambda values: np.reshape(values, (size.mvs, -1))  # noqa: E731
-    lower, upper = by_mv(instance.lower), by_mv(instance.upper)
-    row_low, row_high = by_mv(instance.row_low), by_mv(instance.row_high)
-    x = x.copy()
-    for mv in range(size.mvs):
-        position, own, whole = 0.0, by_mv(x)[mv], structure.whole_blocks(mv)
-        for b, count in enumerate(moves_per_block(structure, mv)):
-            low = max(lower[mv, b], (row_low[mv, b] - position) / count)
-            high = min(upper[mv, b], (row_high[mv, b] - position) / count)
-            own[b] = min(max(own[b], low), high) if b >= whole and low <= high else own[b]
-            position += count * own[b]
-    return x
+def _told(structure: Structure, since: Sequence[int | None] | None) -> np.ndarray:
+    """Samples since the last moves, `LONG_AGO` where nothing is told."""
+    return np.array([LONG_AGO if n is None else n for n in since or (None,) * structure.mv_count])
 
 
 _matrix = jax.jit(dynamic_matrix)
@@ -307,6 +341,7 @@ def solve_plan(
     free_response: Float[ArrayLike, "horizon cv"],
     setpoint: Float[ArrayLike, "horizon cv"],
     previous_moves: Float[ArrayLike, "block mv"] | None = None,
+    samples_since_move: Sequence[int | None] | None = None,
     time_limit: float | None = None,
     gap: float = 1e-6,
     finish: str = "auto",
@@ -314,11 +349,13 @@ def solve_plan(
     """Solve one controller step.
 
     Args:
-        mv_now: MVs before the move, ``"mv"`` [MV unit], within their limits.
+        mv_now: MVs before the move, ``"mv"`` [MV unit], within their limits and on a value of their lists.
         last_move: previous move, ``"mv"`` [MV unit]; oscillation rows use it rounded to whole steps.
         free_response: Lambda at j = 1..Hp with bias, ``"horizon cv"`` [CV unit].
         setpoint: r at j = 1..Hp, ``"horizon cv"`` [CV unit].
         previous_moves: moves to start from, ``"block mv"``; may be infeasible, never changes the answer.
+        samples_since_move: samples since the last move of every MV, for the dwell; 1 for a move at the sample before, None
+            for long ago, which a `last_move` of half a step or more contradicts: the MV has then just moved.
         time_limit: seconds after which the best plan so far is returned with its true gap; None for none.
         gap: relative gap at which the plan counts as optimal.
         finish: ``auto``, ``enumeration``, ``highs`` or ``branch-and-bound``.
@@ -332,4 +369,5 @@ def solve_plan(
         for path, value in (given | {"previous_moves": previous_moves}).items()
     }
     check_position(structure, tuning, known["mv_now"])
+    known["samples_since_move"] = checked_since(structure, samples_since_move)
     return Planner(structure, tuning, model).solve(**known, time_limit=time_limit, gap=gap, finish=finish)

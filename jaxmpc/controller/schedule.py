@@ -212,7 +212,7 @@ class ScheduledCore(Core):
 
     schedule: ModelSchedule
 
-    def consider(self, state: ControllerState, sample: Sample, gap, search=True) -> Moment:
+    def consider(self, state: ControllerState, sample: Sample, gap, search=True, most=np.inf) -> Moment:
         """Observe, pose and decide a sample with the model of the present MVs."""
         standing = self.locate(state, sample.mv, sample.manual).mv
         coefficients = _register(self.schedule, standing, self.size.future)
@@ -220,7 +220,7 @@ class ScheduledCore(Core):
         qp = self.condensed(self.tuning, matrices)
         tables = eqx.tree_at(lambda t: t.scale, self.tables, qp.unit)
         now = Core(self.layout, self.tuning, coefficients, qp, tables, self.size, self.switching)
-        return now.consider(state, sample, gap, search)
+        return now.consider(state, sample, gap, search, most)
 
     def moving(self, before: Float[Array, " mv"], move: Float[Array, " mv"]) -> Float[Array, "cv mv future"]:
         """Coefficients half-way along a move."""
@@ -243,7 +243,7 @@ class _Table:
         self.reference, self.schedule, self.spacing, self.kept = controllers, schedule, spacing, kept
         self.size, self.init, self.structure = controllers.size, controllers.init, controllers.structure
         self.scenarios, self.count = controllers.scenarios, 1
-        self.grid = np.array([step or spacing for step in self.structure.integer_step])
+        self.grid = np.array([step or spacing for step in self.structure.steps])
         self.built = 0  # controllers made so far
         self._table: collections.OrderedDict[tuple[float, ...], Controllers] = collections.OrderedDict()
 

@@ -1,6 +1,7 @@
 """Closing an integer problem by branch and bound over relaxations, the last resort of `integer`.
 
-A node limits the moves and the positions after them, and branches on a move or a position between two whole values. Which
+A node limits the moves and the positions after them, and branches on a move or a position between two whole values, on a
+position in a gap between two allowed ones, and on whether a block moves where a plan breaks the dwell. Which
 one is decided by reliability branching (Achterberg, Koch and Martin 2005): what earlier branchings gained tells, and
 where too few were seen the children of the best candidates are relaxed. The search follows the better child until
 it is pruned, then goes on from the least bound. Every node tightens its limits by what its own prices exclude
@@ -77,10 +78,13 @@ class _Child:
 
 @dataclasses.dataclass(frozen=True)
 class _Branching:
-    """Two children: entry `row` (a move, or from `count` on a position) at most `cut`, or more; estimates of their gains."""
+    """Two children: entry `row` (a move, or from `count` on a position) at most `cut`, or at least `next`, nothing being
+    between them; estimates of their gains.
+    """
 
     row: int
     cut: int
+    next: int
     estimate: tuple[float, float]
 
 
@@ -95,11 +99,14 @@ def branch_and_bound(
     limits = MoveLimits(lower, upper, *position_limits(search.chains))
     tree.keep(_Node(root_bound, limits, model, root.start(0)))
     while True:
-        least = tree.least
+        least = search.still_open = tree.least
         if least >= search.cutoff:
             search.discard(least)
             return np.inf
-        if search.out_of_time() or tree.held > HELD:
+        if tree.held > HELD:
+            search.reason = "the open nodes of branch and bound take the memory that they may, a gigabyte"
+            return least
+        if search.out_of_time():
             return least
         yield from tree.step()
 
@@ -146,6 +153,7 @@ class _Tree:
         """Branch the followed node, and as many of least bound as fill a batch; keeps their children."""
         search, plans, children = self.search, [], []
         while len(children) < LANES and (node := self._take()) is not None:
+            search.check_time()
             if node.bound >= search.cutoff:
                 search.discard(node.bound)
                 continue
@@ -230,21 +238,36 @@ class _Tree:
         at = self.rows @ model.center
         low, high = np.concatenate([limits.lower, limits.low]), np.concatenate([limits.upper, limits.high])
         cut = np.clip(np.floor(at), low, high - 1).astype(int)
-        part = at - cut
-        between = (high > low) & (part > FRACTION) & (part < 1.0 - FRACTION)
+        part, following = at - cut, cut + 1
+        rest = 1.0 - part
+        for chain in self.search.chains:
+            if chain.allowed is not None:  # a gap is left on either side
+                rows = count + chain.columns
+                cut[rows], following[rows] = chain.down(cut[rows]), chain.up(following[rows])
+                part[rows], rest[rows] = at[rows] - cut[rows], following[rows] - at[rows]
+        between = (high > low) & (part > FRACTION) & (rest > FRACTION)
         for chain in self.search.chains:
             moves, positions = chain.columns, count + chain.columns
-            between[positions[0]] = False  # the first position is the first move
-            if between[positions].any() and self._room(limits.low, limits.high, chain) <= self._room(
+            if chain.allowed is None:
+                between[positions[0]] = False  # the first position is the first move
+            if between[positions].any() and self._choices(limits, chain) <= self._room(
                 limits.lower, limits.upper, chain
             ):
                 between[moves[1:]] = False  # a valve's few positions decide its many moves
+        radius = self._radii(model)
+        clash, further = self._too_close(node, radius)
+        if clash.any():  # such a block is at rest or moves
+            between |= clash
+            cut = np.where(clash, np.where(at > 0, 0, -1), cut)
+            following = np.where(clash, cut + 1, following)
+            part = np.where(clash, np.maximum(at - cut, 0.0), part)
+            rest = np.where(clash, np.maximum(following - at, 0.0), rest)
         rows = np.flatnonzero(between)
         if not len(rows):
             return [self._halved(node)]
-        away = np.stack([part, 1.0 - part])
-        radius = self._radii(model)
+        away = np.stack([part, rest])
         gain = np.where(np.isfinite(radius), 0.5 * away**2 / radius, 0.0)
+        gain = np.maximum(gain, further)
         moves = rows[rows < count]
         # the least of a side: with prices of chords the center need not be where nothing is left out
         down = np.minimum.accumulate(model.excess, axis=1)
@@ -262,7 +285,29 @@ class _Tree:
         best = rows[np.argsort(-score[rows], kind="stable")[:TRIED]]
         reliable = self.seen[:, best].min(axis=0) >= RELIABLE
         tried = [row for k, row in enumerate(best) if k == 0 or not reliable[k]]
-        return [_Branching(int(r), int(cut[r]), (float(gain[0, r]), float(gain[1, r]))) for r in tried]
+        return [
+            _Branching(int(r), int(cut[r]), int(following[r]), (float(gain[0, r]), float(gain[1, r])))
+            for r in tried
+        ]
+
+    def _too_close(self, node: _Node, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Entries that are moves within the dwell of others, and by what the others at rest raise the bound of a side."""
+        limits, center = node.limits, node.model.center
+        count = len(center)
+        clash, gain = np.zeros(2 * count, dtype=bool), np.zeros((2, 2 * count))
+        for chain in self.search.chains:
+            if chain.apart is None:
+                continue
+            moves = chain.columns
+            at, low, high = center[moves], limits.lower[moves], limits.upper[moves]
+            moving = np.where(
+                at > FRACTION, (low <= 0) & (high > 0), (at < -FRACTION) & (low < 0) & (high >= 0)
+            )
+            clash[moves] = moving & (moving @ chain.apart)
+            own = np.where(np.isfinite(radius[moves]), 0.5 * at**2 / radius[moves], 0.0)
+            others = np.where(chain.apart & moving, own, 0.0).max(axis=1)
+            gain[np.where(at > 0, 1, 0), moves] = np.where(clash[moves], others, 0.0)
+        return clash, gain
 
     def _score(self, down, up, bound: float):
         """Of a branching by the gains of its children."""
@@ -274,23 +319,47 @@ class _Tree:
         """All moves are whole, but the relaxation is not exact there: separate the dearest move's value from others."""
         limits, model = node.limits, node.model
         free = np.flatnonzero(limits.upper > limits.lower)
+        passing = self._passing(node)
+        if passing is not None:
+            return passing
         if not len(free):
-            return _Branching(0, int(limits.lower[0]), (0.0, 0.0))
+            return _Branching(0, int(limits.lower[0]), int(limits.lower[0]) + 1, (0.0, 0.0))
         place = np.clip(np.round(model.center[free]), limits.lower[free], limits.upper[free]).astype(int)
         own = model.excess[free, place - model.lower[free]]
         k = int(np.argmax(own + 1e-9 * (limits.upper - limits.lower)[free]))
         row = int(free[k])
-        return _Branching(row, int(min(place[k], limits.upper[row] - 1)), (0.0, 0.0))
+        cut = int(min(place[k], limits.upper[row] - 1))
+        return _Branching(row, cut, cut + 1, (0.0, 0.0))
+
+    def _passing(self, node: _Node) -> _Branching | None:
+        """A branching on the move or the start of a block that passes a position that is not allowed, if there is one."""
+        limits, count = node.limits, len(node.model.center)
+        for chain in self.search.chains:
+            if chain.allowed is None or chain.counts.max() == 1:
+                continue
+            moves = whole(node.model.center[chain.columns])
+            before = np.cumsum(moves * chain.counts) - moves * chain.counts
+            for b, column in enumerate(chain.columns):
+                if chain.passes(b, before[b], moves[b]):
+                    continue
+                if limits.lower[column] < limits.upper[column]:
+                    cut = int(np.clip(moves[b], limits.lower[column], limits.upper[column] - 1))
+                    return _Branching(int(column), cut, cut + 1, (0.0, 0.0))
+                row = int(chain.columns[b - 1]) if b else 0
+                if b and limits.low[row] < limits.high[row]:
+                    cut = int(chain.down(np.clip(before[b], limits.low[row], limits.high[row] - 1)))
+                    return _Branching(count + row, cut, int(chain.up(np.asarray(cut + 1))), (0.0, 0.0))
+        return None
 
     def _children(self, node: _Node, branching: _Branching) -> tuple[_Child, _Child]:
-        """The children, not relaxed yet: at most the cut, and more."""
+        """The children, not relaxed yet: at most the cut, and from the next value on."""
         count = len(node.limits.lower)
         row = branching.row % count
         down, up = (_Child(MoveLimits(*map(np.copy, node.limits)), node.start) for _ in range(2))
         if branching.row < count:
-            down.limits.upper[row], up.limits.lower[row] = branching.cut, branching.cut + 1
+            down.limits.upper[row], up.limits.lower[row] = branching.cut, branching.next
         else:
-            down.limits.high[row], up.limits.low[row] = branching.cut, branching.cut + 1
+            down.limits.high[row], up.limits.low[row] = branching.cut, branching.next
         return down, up
 
     def _chosen(self, node: _Node, plan: list[tuple[_Branching, tuple[_Child, _Child]]]) -> None:
@@ -357,7 +426,7 @@ class _Tree:
     def _learn(self, node: _Node, branching: _Branching, side: int, bound: float) -> None:
         """Take down what one child gained per step."""
         at = float(self.rows[branching.row] @ node.model.center)
-        away = at - branching.cut if side == 0 else branching.cut + 1 - at
+        away = at - branching.cut if side == 0 else branching.next - at
         if away > FRACTION and np.isfinite(bound):
             self.gains[side, branching.row] += max(bound - node.bound, 0.0) / away
             self.seen[side, branching.row] += 1
@@ -382,6 +451,9 @@ class _Tree:
         for chain in self.search.chains:
             wanted = np.cumsum(moves[:, chain.columns] * chain.counts, axis=1)
             position = np.zeros(len(moves))
+            if chain.restricted:
+                result[:, chain.columns] = _followed(chain, wanted)
+                continue
             for b, column in enumerate(chain.columns):
                 result[:, column] = np.round((wanted[:, b] - position) / chain.counts[b])
                 position += result[:, column] * chain.counts[b]
@@ -428,7 +500,9 @@ class _Tree:
         if not np.isfinite(search.value) or self._log_size(node) > self.list_up_to:
             return False
         chains = within(search.chains, limits)
-        found = enumerate_below(model, chains, limits.lower, limits.upper, search.cutoff, LISTED)
+        found = enumerate_below(
+            model, chains, limits.lower, limits.upper, search.cutoff, LISTED, check_time=search.check_time
+        )
         if found is None:
             self.list_up_to -= 1.0
             return False
@@ -462,13 +536,39 @@ class _Tree:
         """Logarithm of the whole moves in the node's level set, estimated by its box."""
         limits = node.limits
         by_moves = [self._room(limits.lower, limits.upper, chain) for chain in self.search.chains]
-        by_positions = [self._room(limits.low, limits.high, chain) for chain in self.search.chains]
+        by_positions = [self._choices(limits, chain) for chain in self.search.chains]
         return sum(map(min, by_moves, by_positions))
+
+    def _choices(self, limits: MoveLimits, chain: Chain) -> float:
+        """Logarithm of the combinations of one MV's allowed positions within limits."""
+        if chain.allowed is None:
+            return self._room(limits.low, limits.high, chain)
+        low, high = limits.low[chain.columns], limits.high[chain.columns]
+        count = np.searchsorted(chain.allowed, high, side="right") - np.searchsorted(chain.allowed, low)
+        return float(np.log(np.maximum(count, 1)).sum())
 
     @staticmethod
     def _room(low: np.ndarray, high: np.ndarray, chain: Chain) -> float:
         """Logarithm of the combinations of one MV's moves or positions within limits."""
         return float(np.log(high[chain.columns] - low[chain.columns] + 1.0).sum())
+
+
+def _followed(chain: Chain, wanted: np.ndarray) -> np.ndarray:
+    """Whole moves of a restricted chain along wanted positions ``"lane block"``: to the nearest allowed, with rests."""
+    moves = np.zeros(wanted.shape)
+    position = np.zeros(len(wanted), dtype=int)
+    for b, count in enumerate(chain.counts):
+        there = np.clip(np.nan_to_num(wanted[:, b]), -1e15, 1e15)
+        if chain.allowed is not None:
+            below, above = chain.down(np.floor(there)), chain.up(np.ceil(there))
+            there = np.where(there - below <= above - there, below, above)
+        move = np.round((there - position) / count)
+        move = np.where(chain.passes(b, position, move), move, 0)
+        if chain.apart is not None:
+            move = np.where((moves[:, :b] != 0) @ chain.apart[b, :b], 0, move)
+        moves[:, b] = move
+        position = position + (move * count).astype(int)
+    return moves
 
 
 def _both(one: MoveLimits, other: MoveLimits) -> MoveLimits:

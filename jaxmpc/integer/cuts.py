@@ -11,6 +11,8 @@ best candidates of a level set close nearly every step of the thesis's controlle
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -41,10 +43,15 @@ def cut_of(constants: Constants, result: Relaxations, lane: int, lower, upper):
 
 
 class Cuts:
-    """The cuts of one scenario."""
+    """The cuts of one scenario.
 
-    def __init__(self, constants: Constants):
-        self.constants = constants
+    Args:
+        constants: of the scenario.
+        check_time: called between two cuts of many points; may raise to end it.
+    """
+
+    def __init__(self, constants: Constants, check_time: Callable[[], None] = lambda: None):
+        self.constants, self.check_time = constants, check_time
         self.list: list[tuple[float, np.ndarray, np.ndarray]] = []
 
     def add(self, result: Relaxations, lane: int, lower, upper) -> None:
@@ -64,6 +71,7 @@ class Cuts:
         c = self.constants
         best = np.full(len(points), -np.inf)
         for value, at, gradient in self.list[first:]:
+            self.check_time()
             away = points - at
             curved = away @ c.root_factor
             best = np.maximum(best, value + away @ gradient + 0.5 * np.einsum("pi,pi->p", curved, curved))

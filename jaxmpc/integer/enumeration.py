@@ -39,7 +39,9 @@ def enumerate_all(
         limited: give up where the list grows beyond `MOST`, or is not done after `PATIENCE` rounds.
     """
     most = max(min(MOST, CELLS // max(len(lower), 1)), 1) if limited else None
-    found = enumerate_below(model, search.chains, lower, upper, search.cutoff, most)
+    found = enumerate_below(
+        model, search.chains, lower, upper, search.cutoff, most, check_time=search.check_time
+    )
     if found is None:
         return False
     search.discard(search.cutoff)

@@ -2,13 +2,15 @@
 
 The problem over whole moves is V(d) = sum_i own_i(d_i) + R(d) with R convex. One binary per admissible value of a free
 move makes any separable term exactly linear (for -1/0/1 these are the usual p and q with move = p - q), and cuts
-of R from solved problems bound the rest from below (outer approximation, Duran and Grossmann 1986).
+of R from solved problems bound the rest from below (outer approximation, Duran and Grossmann 1986). Positions of a list
+with gaps have one binary per allowed value, and of the moves within a dwell one at most is none of the binaries of zero.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import importlib.metadata
 import os
 import threading
 
@@ -16,6 +18,9 @@ import highspy
 import numpy as np
 
 from jaxmpc.integer.feasible import Chain
+from jaxmpc.programs.compilation import say
+
+ROUNDING = 1e-6  # by which answers of HiGHS may be off
 
 _FIRST = threading.Lock()
 
@@ -42,6 +47,21 @@ def _swallow_greeting() -> None:
         highspy.Highs()
 
 
+def contradiction(claim: float, known: float, what: str) -> str:
+    """Say on standard error that HiGHS claims what a known plan disproves; returns the line.
+
+    Args:
+        claim: bound that HiGHS calls proven, infinite where it finds nothing feasible.
+        known: objective that disproves it.
+        what: whose objective that is, such as ``a known plan``.
+    """
+    version = importlib.metadata.version("highspy")
+    found = f"a bound of {claim:.12g}" if np.isfinite(claim) else "that nothing is feasible"
+    line = f"HiGHS (highspy {version}) claims {found}, but {what} has {known:.12g}: its answer is dropped"
+    say(line)
+    return line
+
+
 class ReducedMilp:
     """min sum own_i(d_i) + theta over the whole moves that are still free; theta is bounded below by cuts.
 
@@ -59,6 +79,7 @@ class ReducedMilp:
         self.free = np.flatnonzero(upper > lower)
         self.base = float(sum(own[i, 0] for i in range(len(lower)))) / unit
         self.first_column = {}
+        self.forbidden: set[bytes] = set()
         highs = self.highs = _silent_highs()
         for option, value in (
             ("threads", 1),
@@ -83,6 +104,11 @@ class ReducedMilp:
             if width > 1:
                 self._row(-np.inf, 1.0, np.arange(column - width, column), np.ones(width))
         self._hard_rows(chains)
+        for chain in chains:
+            if chain.allowed is not None:
+                self._allowed_rows(chain)
+            if chain.apart is not None:
+                self._dwell_rows(chain)
         self.cutoff_row = highs.getNumRow()
         costs = np.asarray(highs.getLp().col_cost_)
         index = np.flatnonzero(costs)
@@ -128,6 +154,51 @@ class ReducedMilp:
                 if len(index) and (most > high + 1e-9 or least < low - 1e-9):
                     self._row(low - constant, high - constant, index, value)
 
+    def _allowed_rows(self, chain: Chain) -> None:
+        """Every sample's position is one of the allowed ones."""
+        assert chain.allowed is not None
+        for b, count in enumerate(chain.counts):
+            for sample in range(1, int(count) + 1):
+                wide = np.zeros(len(self.lower))
+                wide[chain.columns[:b]], wide[chain.columns[b]] = chain.counts[:b], sample
+                index, value, constant = self._in_binaries(wide)
+                reach = wide * (self.upper - self.lower)
+                least, most = constant + np.minimum(reach, 0.0).sum(), constant + np.maximum(reach, 0.0).sum()
+                among = chain.allowed[(chain.allowed >= least) & (chain.allowed <= most)].astype(float)
+                if len(among) == most - least + 1:
+                    continue  # nothing is left out
+                first = self.highs.getNumCol()
+                for _ in among:
+                    self.highs.addVar(0.0, 1.0)
+                    self.highs.changeColIntegrality(self.highs.getNumCol() - 1, highspy.HighsVarType.kInteger)
+                place = first + np.arange(len(among))
+                self._row(1.0, 1.0, place, np.ones(len(among)))
+                self._row(
+                    -constant, -constant, np.concatenate([index, place]), np.concatenate([value, -among])
+                )
+
+    def _dwell_rows(self, chain: Chain) -> None:
+        """Of blocks within the dwell one at most moves."""
+        assert chain.apart is not None
+        blocks = len(chain.columns)
+        moving = [self._moving(int(column)) for column in chain.columns]
+        for b in range(blocks):
+            near = [b, *(b + 1 + np.flatnonzero(chain.apart[b, b + 1 :]))]
+            index = np.concatenate([moving[c][0] for c in near])
+            value = np.concatenate([moving[c][1] for c in near])
+            self._row(-np.inf, 1.0 - sum(moving[c][2] for c in near), index, value)
+
+    def _moving(self, i: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """Whether a move is none of zero, as columns, values and constant of a linear form."""
+        if i not in self.first_column:
+            return np.zeros(0, dtype=int), np.zeros(0), float(self.lower[i] != 0)
+        columns = self.first_column[i] + np.arange(int(self.upper[i] - self.lower[i]))
+        if self.lower[i] == 0:
+            return columns, np.ones(len(columns)), 0.0
+        if self.lower[i] < 0 <= self.upper[i]:
+            return columns[-self.lower[i] - 1 : -self.lower[i]], -np.ones(1), 1.0
+        return columns[:0], np.zeros(0), 1.0
+
     def add_cut(self, value: float, at: np.ndarray, gradient: np.ndarray) -> None:
         """Theta >= value + gradient'(d - at)."""
         index, slope, constant = self._in_binaries(gradient / self.unit)
@@ -141,6 +212,7 @@ class ReducedMilp:
 
     def forbid(self, point: np.ndarray) -> None:
         """No-good cut: at least one free move differs from `point`."""
+        self.forbidden.add(point.tobytes())
         index, value, right = [], [], 1.0
         for i in self.free:
             width = int(self.upper[i] - self.lower[i])
@@ -253,6 +325,7 @@ def solve_milp(
     *,
     gap: float = 1e-9,
     seconds: float | None = None,
+    known: np.ndarray | None = None,
 ) -> tuple[str, np.ndarray | None, float]:
     """Min cost'x subject to row_low <= A x <= row_high, low <= x <= high, x_i whole where `integer`.
 
@@ -263,10 +336,11 @@ def solve_milp(
         integer: ``"n"``, true for whole variables.
         gap: relative gap at which the search stops.
         seconds: time limit, None for none.
+        known: a feasible point, None for none; what it disproves is not believed.
 
     Returns:
-        ``(status, x, bound)``: ``optimal``, ``limit``, ``infeasible`` or ``failed``; the best point, None without one;
-        the proven lower bound of the cost.
+        ``(status, x, bound)``: ``optimal``, ``limit``, ``infeasible`` or ``failed``, which includes answers that contradict
+        themselves or what is known; the best point, None without one; the proven lower bound of the cost.
     """
     highs = _silent_highs()
     for option, value in (
@@ -294,10 +368,31 @@ def solve_milp(
     highs.passModel(lp)
     highs.run()
     state, info = highs.getModelStatus(), highs.getInfo()
+    worth = -np.inf if known is None else float(cost @ known)
     if state in (highspy.HighsModelStatus.kInfeasible, highspy.HighsModelStatus.kUnboundedOrInfeasible):
+        if known is not None:
+            contradiction(np.inf, worth, "a known point")
+            return "failed", None, -np.inf
         return "infeasible", None, np.inf
     found = np.array(highs.getSolution().col_value) if info.primal_solution_status == 2 else None
     bound = info.mip_dual_bound if np.any(integer) else info.objective_function_value
+    if found is not None:
+        reached = np.bincount(row, value * found[column], minlength=len(row_low))
+        slack = ROUNDING * (1.0 + np.bincount(row, np.abs(value * found[column]), minlength=len(row_low)))
+        broken = (reached < row_low - slack) | (reached > row_high + slack)
+        outside = (found < low - ROUNDING * (1.0 + np.abs(found))) | (
+            found > high + ROUNDING * (1.0 + np.abs(found))
+        )
+        between = integer & (np.abs(found - np.round(found)) > ROUNDING)
+        if broken.any() or outside.any() or between.any():
+            contradiction(float(bound), float(cost @ found), "its own point, which breaks rows or limits,")
+            return "failed", None, -np.inf
+        worth, whose = (
+            (worth, "a known point") if known is not None else (float(cost @ found), "its own point")
+        )
+        if bound > worth + ROUNDING * (1.0 + abs(worth)):
+            contradiction(float(bound), worth, whose)
+            return "failed", None, -np.inf
     if state == highspy.HighsModelStatus.kOptimal:
         return "optimal", found, float(bound)
     limits = (highspy.HighsModelStatus.kTimeLimit, highspy.HighsModelStatus.kIterationLimit)

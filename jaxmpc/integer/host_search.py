@@ -6,34 +6,53 @@ search is a generator: it yields what it needs solved and is sent the results, s
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Generator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from jaxmpc.integer.feasible import UNBOUNDED, Chain, chains_of, nearest, satisfied, whole
+from jaxmpc.integer.actuators import Actuator
+from jaxmpc.integer.feasible import (
+    UNBOUNDED,
+    Chain,
+    UndecidedError,
+    chains_of,
+    held_within,
+    nearest,
+    satisfied,
+    whole,
+)
 from jaxmpc.integer.followed import followed
 from jaxmpc.integer.lower_bound import LowerModel
 from jaxmpc.integer.relaxer import LaneLimits, Relaxations
 from jaxmpc.integer.tables import Constants
 from jaxmpc.problem.instance import QpInstance
 from jaxmpc.programs.clock import Clock
-from jaxmpc.relaxed.gap import FINEST, closes, cutoff, reference
+from jaxmpc.programs.progress import Seen
+from jaxmpc.relaxed.gap import FINEST, closes, cutoff, reference, relative_gap
 from jaxmpc.relaxed.newton import WarmStart
-from jaxmpc.status import FAILED, INFEASIBLE, LIMIT, OPTIMAL
+from jaxmpc.status import FAILED, INFEASIBLE, LIMIT, OPTIMAL, OUT_OF_TIME, UNPROVEN
 
+NO_MOVES = "no moves satisfy the hard limits: positions, moves per sample, oscillation rows, mean-move limit"
+NOT_CLOSED = "rounding leaves a gap that branching does not close"
 NEARLY = 1e-12  # of a curvature, added where it may be singular
 GROUP = 8  # problems a search asks for at once: as many as one small batch holds
 
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """Relaxed problems a search wants solved: their limits and where to start, first axis ``"lane"``."""
+    """Relaxed problems a search wants solved: their limits and where to start, first axis ``"lane"``.
+
+    Where they are only `evaluated`, no Newton step is taken. The answer holds as many of them, the first ones, as the time
+    limit leaves time for; None for none.
+    """
 
     limits: LaneLimits
     starts: WarmStart
+    evaluated: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,12 +62,19 @@ class Offload:
     work: Callable[[], Any]
 
 
+class OutOfTimeError(Exception):
+    """The time limit of a search is used up, or the next piece of its work would not end in time."""
+
+
 Steps = Generator[Request | Offload, Any, Any]  # a search, or a part of one
 
 
 @dataclasses.dataclass
 class SearchResult:
-    """Outcome of an integer solve: scaled moves, value, bound, status code, who finished, nodes, root prices, seconds."""
+    """Outcome of an integer solve: scaled moves, value, bound, status code, who finished, nodes, root prices, seconds.
+
+    `reason` is a sentence that says why it is not optimal, None where it is.
+    """
 
     x: np.ndarray | None
     value: float
@@ -58,6 +84,20 @@ class SearchResult:
     nodes: int
     root: WarmStart | None = None
     seconds: float = 0.0
+    reason: str | None = None
+
+
+def no_whole_moves(by: str | None = None, nodes: int = 0) -> SearchResult:
+    """Of a problem whose hard limits no whole moves satisfy."""
+    return SearchResult(None, np.inf, np.inf, INFEASIBLE, by, nodes, reason=NO_MOVES)
+
+
+class Known(NamedTuple):
+    """What is known of a problem before its search: scaled moves, their value (infinite for none), and a bound."""
+
+    x: np.ndarray
+    value: float
+    bound: float
 
 
 class Search:
@@ -69,6 +109,7 @@ class Search:
         root: its solved relaxation, lane 0.
         gap: relative gap at which a solve is optimal.
         time_limit: seconds of work on this problem after which the best plan so far is returned; None for none.
+        actuators: what the integer MVs must keep besides limits and rows; none if that is all.
     """
 
     def __init__(
@@ -78,17 +119,22 @@ class Search:
         root: Relaxations,
         gap: float,
         time_limit: float | None,
+        actuators: Sequence[Actuator] = (),
     ):
         self.constants, self.instance, self.time_limit = constants, instance, time_limit
         self.gap = max(gap, FINEST)
         self.limits = np.asarray(instance.lower), np.asarray(instance.upper)
-        self.chains: list[Chain] = chains_of(constants.structure, constants.size, instance)
+        self.chains: list[Chain] = chains_of(constants.structure, constants.size, instance, actuators)
+        self.restricted = any(chain.restricted for chain in self.chains)
         # whether it takes more than the chains to tell which whole moves can be followed
         self.followed = constants.structure.relaxed_moves and constants.size.windows > 0
         self.root, self.start = root, root.start(0)
         self.root_bound = max(float(root.bound[0]), 0.0)  # every term of (6.6) is non-negative
         self.value, self.x = np.inf, None
         self.left_out = np.inf  # least bound of everything that was discarded
+        self.still_open = -np.inf  # least bound of what is open, as far as it is known
+        self.stopped = False  # whether the time limit has ended it
+        self.reason = NOT_CLOSED  # why it ends if that is without a proof and before its time
         self.nodes = 1
         self.seen: set[bytes] = set()
         self.spent = 0.0  # seconds of work so far, kept by the scheduler,
@@ -107,7 +153,17 @@ class Search:
 
     def out_of_time(self) -> bool:
         """Whether the time limit is used up."""
-        return self.time_limit is not None and self._used() >= self.time_limit
+        self.stopped = self.stopped or (self.time_limit is not None and self._used() >= self.time_limit)
+        return self.stopped
+
+    def check_time(self) -> None:
+        """Called inside whatever may take longer than a millisecond.
+
+        Raises:
+            OutOfTimeError: where the time limit is used up.
+        """
+        if self.out_of_time():
+            raise OutOfTimeError
 
     def _used(self) -> float:
         return self.spent + (self.clock.seconds if self.clock else 0.0)
@@ -115,6 +171,23 @@ class Search:
     def seconds_left(self) -> float | None:
         """Seconds to the time limit, None without one."""
         return None if self.time_limit is None else max(self.time_limit - self._used(), 0.0)
+
+    def seen_after(self, seconds: float) -> Seen:
+        """What is known of it now, for whoever waits."""
+        value, bound = self.value, min(max(min(self.left_out, self.still_open), self.root_bound), self.value)
+        gap = float(relative_gap(value, bound, self.constants.scale)) if np.isfinite(value) else np.nan
+        return Seen(seconds, value, bound, gap)
+
+    def take(self, known: Known) -> None:
+        """Start from what others have found."""
+        self.root_bound = max(self.root_bound, known.bound)
+        if known.value < self.value and self.allows(known.x):
+            self.value, self.x = known.value, known.x.copy()
+
+    def may_tighten(self) -> bool:
+        """Whether chords tighten the relaxation, as far as there is time to find out."""
+        weight = self.constants.chords_within(self.seconds_left())
+        return weight is not None and bool(weight.any())
 
     def discard(self, bound: float) -> None:
         """Record the bound of something that is not searched further."""
@@ -127,6 +200,7 @@ class Search:
         upper: np.ndarray,
         starts: list[WarmStart] | None = None,
         positions: tuple[np.ndarray, np.ndarray] | None = None,
+        evaluated: bool = False,
     ) -> Steps:
         """Solve relaxed problems with integer limits ``"batch integer"``; returns `Relaxations`.
 
@@ -136,6 +210,10 @@ class Search:
             starts: prices to start from, one per problem; the root's if not given.
             positions: lower and upper limits of the position after every integer move [steps]; the problem's own if not
                 given.
+            evaluated: whether the moves of the starts are evaluated only.
+
+        Raises:
+            OutOfTimeError: where there is no time for all of them; those that are solved were offered as incumbents.
         """
         count, integer = len(lower), self.constants.integer
         own = *self.limits, np.asarray(self.instance.row_low), np.asarray(self.instance.row_high)
@@ -149,11 +227,21 @@ class Search:
             stacked = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape)), self.start)
         else:
             stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *starts)
-        return (yield Request(limits, stacked))
+        result = yield Request(limits, stacked, evaluated)
+        self.stopped = self.stopped or result is None or len(result.bound) < count
+        if result is None:
+            raise OutOfTimeError
+        if len(result.bound) < count:
+            for lane in range(len(result.bound)):
+                self.offer(result, lane)
+            raise OutOfTimeError
+        return result
 
     def offer(self, result: Relaxations, lane: int) -> None:
         """Take a solved problem with its integer moves rounded as incumbent if that is better."""
         if result.snapped[lane] < self.value and np.isfinite(result.x[lane]).all():
+            if self.restricted and not self.allows(result.x[lane]):
+                return
             self.value, self.x = float(result.snapped[lane]), result.x[lane].copy()
             self.x[self.constants.integer] = np.round(self.x[self.constants.integer])
 
@@ -212,12 +300,17 @@ class Search:
         return LowerModel(value, center, lower, upper, excess, c.schur, c.radius, c.order, c.leading)
 
     # ---- incumbents
+    def allows(self, x: np.ndarray) -> bool:
+        """Whether moves, the integer ones rounded, keep all that whole moves must."""
+        low, high = (whole(values[self.constants.integer]) for values in self.limits)
+        return bool(satisfied(self.chains, whole(x[self.constants.integer])[None], low, high)[0])
+
     def rounded(self, moves: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray | None:
         """Whole moves near `moves` that satisfy the hard rows, or None where there are none; see `nearest`."""
         point = np.clip(whole(moves), lower, upper)
         if satisfied(self.chains, point[None], lower, upper)[0]:
             return point
-        point = nearest(self.chains, moves, lower, upper)
+        point = nearest(self.chains, moves, lower, upper, self.check_time)
         return point if point is not None and satisfied(self.chains, point[None], lower, upper)[0] else None
 
     def new(self, points: Sequence[np.ndarray | None]) -> np.ndarray:
@@ -225,13 +318,37 @@ class Search:
         fresh = {p.tobytes(): p for p in points if p is not None and p.tobytes() not in self.seen}
         return np.array(list(fresh.values())).reshape(len(fresh), len(self.constants.integer))
 
+    def salvaged(self, starts: Sequence[np.ndarray]) -> Steps:
+        """Without a plan at the end of the time: one that needs no solve, near the relaxed moves, a start, or no moves."""
+        c = self.constants
+        low, high = (whole(limits[c.integer]) for limits in self.limits)
+        relaxed = np.nan_to_num(self.root.x[0])
+        for wanted in (relaxed[c.integer], *starts, np.zeros(len(low))):
+            point = np.clip(whole(wanted), low, high)
+            if satisfied(self.chains, point[None], low, high)[0]:
+                break
+        else:
+            with contextlib.suppress(UndecidedError):
+                point = nearest(self.chains, relaxed[c.integer], low, high)
+            if point is None or not satisfied(self.chains, point[None], low, high)[0]:
+                return
+        x = held_within(c.structure, c.size, self.instance, relaxed)
+        x[c.integer] = point
+        start = dataclasses.replace(self.start, x=x)
+        with contextlib.suppress(OutOfTimeError):
+            result = yield from self.relax(point[None], point[None], [start], evaluated=True)
+            self.offer(result, 0)
+
     # ---- finishing
     def finish(self, by: str | None, bound: float) -> SearchResult:
         """Assemble the result; `bound` is the least bound of what is still open."""
         bound = min(max(min(self.left_out, bound), self.root_bound), self.value)
         if self.x is None:
-            status = INFEASIBLE if by is not None else FAILED
-            return SearchResult(None, np.inf, np.inf if by else bound, status, by, self.nodes)
-        closed = closes(self.value, bound, self.constants.scale, self.gap)
-        status, by = (OPTIMAL, by) if closed else (LIMIT, None)
-        return SearchResult(self.x, self.value, bound, status, by, self.nodes, self.start)
+            if by is not None:
+                return no_whole_moves(by, self.nodes)
+            status, reason = (LIMIT, OUT_OF_TIME) if self.stopped else (FAILED, self.reason)
+            return SearchResult(None, np.inf, bound, status, None, self.nodes, reason=reason)
+        if closes(self.value, bound, self.constants.scale, self.gap):
+            return SearchResult(self.x, self.value, bound, OPTIMAL, by, self.nodes, self.start)
+        status, reason = (LIMIT, OUT_OF_TIME) if self.stopped else (UNPROVEN, self.reason)
+        return SearchResult(self.x, self.value, bound, status, None, self.nodes, self.start, reason=reason)

@@ -58,16 +58,21 @@ def fits(
 
 
 class Listed(NamedTuple):
-    """Whole moves with a bound below a cutoff; `count` may be more than the arrays hold, which then hold too few."""
+    """Whole moves with a bound below a cutoff.
+
+    `count` may be more than the arrays hold, which then hold too few; `looked_at` blocks were extended on the way.
+    """
 
     codes: Array
     bounds: Array
     count: Array
+    looked_at: Array
 
     @classmethod
     def empty(cls) -> Listed:
         """Nothing is left."""
-        return cls(jnp.zeros(LONGEST, dtype=int), jnp.full(LONGEST, jnp.inf), jnp.zeros((), dtype=int))
+        none = jnp.zeros((), dtype=int)
+        return cls(jnp.zeros(LONGEST, dtype=int), jnp.full(LONGEST, jnp.inf), none, none)
 
 
 def encode(points: Float[Array, "*point integer"]) -> Int[Array, "*point"]:
@@ -103,16 +108,20 @@ def grid_below(tables: Tables, limits: PositionLimits, model: LowerBound, sizes,
         jnp.pad(encode(points), (0, rest)),
         jnp.pad(bounds, (0, rest), constant_values=np.inf),
         jnp.asarray(len(points)),
+        jnp.zeros((), dtype=int),
     )
 
 
-def list_below(tables: Tables, limits: PositionLimits, model: LowerBound, cutoff) -> Listed:
-    """Breadth-first search, move by move; `BLOCK` partial assignments at a time get their next move."""
+def list_below(tables: Tables, limits: PositionLimits, model: LowerBound, cutoff, most) -> Listed:
+    """Breadth-first search, move by move; `BLOCK` partial assignments at a time get their next move.
+
+    After `most` blocks it is given up as too long.
+    """
     moves, room = tables.column.shape[0], LONGEST + 3 * BLOCK
     reach, previous, leading = tables.reach, tables.previous, tables.leading
 
     def assign(carry):
-        i, codes, bounds, count = carry
+        i, codes, bounds, count, looked_at = carry
         now, then = i % 2, (i + 1) % 2
         row = leading[i]
         shift = row @ model.center
@@ -139,18 +148,20 @@ def list_below(tables: Tables, limits: PositionLimits, model: LowerBound, cutoff
             bounds = jax.lax.dynamic_update_slice(bounds, total.reshape(-1)[source][None], (then, found))
             return begin + BLOCK, codes, bounds, jnp.minimum(found + ranks[-1], LONGEST + 1)
 
-        _, codes, bounds, found = jax.lax.while_loop(
+        begin, codes, bounds, found = jax.lax.while_loop(
             lambda carry: (carry[0] < count) & (carry[3] <= LONGEST), extend, (0, codes, bounds, 0)
         )
-        return i + 1, codes, bounds, jnp.asarray(found)
+        looked_at += begin // BLOCK
+        found = jnp.where((looked_at > most) & (i + 1 < tables.count), LONGEST + 1, found)
+        return i + 1, codes, bounds, found, looked_at
 
     codes = jnp.zeros((2, room), dtype=int)
     bounds = jnp.full((2, room), jnp.inf).at[0, 0].set(model.value)
-    assigned, codes, bounds, count = jax.lax.while_loop(
+    assigned, codes, bounds, count, looked_at = jax.lax.while_loop(
         lambda carry: (carry[0] < tables.count) & (carry[3] <= LONGEST),
         assign,
-        (0, codes, bounds, jnp.asarray(1)),
+        (0, codes, bounds, jnp.asarray(1), jnp.asarray(0)),
     )
     end = assigned % 2
     there = np.arange(LONGEST) < count
-    return Listed(codes[end, :LONGEST], jnp.where(there, bounds[end, :LONGEST], jnp.inf), count)
+    return Listed(codes[end, :LONGEST], jnp.where(there, bounds[end, :LONGEST], jnp.inf), count, looked_at)

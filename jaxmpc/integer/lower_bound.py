@@ -13,6 +13,7 @@ whose bound stays below the incumbent can improve on it.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -147,6 +148,7 @@ def enumerate_below(
     cutoff: float,
     most: int | None,
     beam: int | None = None,
+    check_time: Callable[[], None] = lambda: None,
 ) -> tuple[np.ndarray, np.ndarray, float] | None:
     """All whole moves within limits whose bound is below `cutoff`: as a grid, or by breadth-first search over the blocks.
 
@@ -158,6 +160,7 @@ def enumerate_below(
         most: give up (return None) when more partial assignments than this are alive at once; None for as many as
             fit into memory.
         beam: keep only so many partial assignments of least bound, to find good moves rather than all.
+        check_time: called between two moves; may raise to end it.
 
     Returns:
         ``(moves "point integer", bounds "point", least)`` sorted by bound, `least` being the smallest bound of
@@ -173,9 +176,13 @@ def enumerate_below(
     position = np.zeros((1, len(chains)), dtype=int)
     least = np.inf
     for i, column in enumerate(model.order):
+        check_time()
         k, b = owner[int(column)]
         chain = chains[k]
         domain = np.arange(int(lower[column]), int(upper[column]) + 1)
+        if chain.allowed is not None:  # few of many moves end where they may
+            away = np.unique(chain.allowed[:, None] - np.unique(position[:, k]))
+            domain = np.intersect1d(domain, away[away % chain.counts[b] == 0] // chain.counts[b])
         if len(bounds) * len(domain) > CELLS:
             if beam is None:
                 return None
@@ -191,6 +198,11 @@ def enumerate_below(
         good = (reached >= chain.low[b]) & (reached <= chain.high[b])
         if chain.coupled[b]:
             good &= np.abs(domain - moves[:, place[chain.columns[b - 1]], None]) <= 1
+        if chain.allowed is not None:
+            good &= chain.passes(b, position[:, k, None], domain)
+        if chain.apart is not None:
+            near = [place[column] for column in chain.columns[:b][chain.apart[b, :b]]]
+            good &= (domain == 0) | (moves[:, near] == 0).all(axis=1, keepdims=True)
         below = total < cutoff
         if np.isfinite(cutoff):
             out = good & ~below

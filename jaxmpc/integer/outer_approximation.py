@@ -25,7 +25,10 @@ WIDEST = 20_000  # binaries of a master, one for every value of a free move
 def outer_approximation(
     search: Search, model: LowerModel, cuts: Cuts, lower, upper, seconds: float | None
 ) -> Steps:
-    """Close the reduced problem with MILPs over cuts; returns whether it is closed, and the bound reached.
+    """Close the reduced problem with MILPs over cuts.
+
+    What HiGHS claims is held against all plans that are solved: one that it may still choose is a witness, whose value no
+    bound may be above. A claim that is disproven ends it, and nothing of the claim is used.
 
     Args:
         search: state of the solve.
@@ -34,10 +37,17 @@ def outer_approximation(
         lower: limits of the integer moves, equal where a move is fixed.
         upper: the same.
         seconds: time limit from here on, None for none.
+
+    Returns:
+        Whether it is closed, and the bound reached.
+
+    Raises:
+        ContradictionError: where HiGHS has claimed what a known plan disproves.
     """
     if (upper - lower).sum() > WIDEST:
         return False, search.root_bound
-    from jaxmpc.integer.highs import ReducedMilp  # HiGHS is loaded when it is first needed
+    # HiGHS is loaded when it is first needed
+    from jaxmpc.integer.highs import ROUNDING, ReducedMilp, contradiction
 
     c = search.constants
     limit = None if seconds is None else search.spent + seconds
@@ -56,8 +66,21 @@ def outer_approximation(
         left = None if limit is None else limit - search.spent
         if left is not None and left <= 0:
             return False, best_bound
-        master.set_cutoff(search.cutoff)
+        witness = tangents.witness(search, master.forbidden, lower, upper)
+        slack = ROUNDING * (abs(witness) + unit) if np.isfinite(witness) else 0.0
+        master.set_cutoff(
+            max(search.cutoff, witness + 0.1 * slack) if np.isfinite(witness) else search.cutoff
+        )
         bound, point, finished = yield Offload(lambda left=left: master.solve(left))
+        if bound > witness + slack:
+            raise ContradictionError(contradiction(bound, witness, "a known plan"))
+        if point is not None:
+            fits = satisfied(search.chains, point[None], lower, upper)[0]
+            value = float(tangents.values(point[None])[0])  # minus infinity before the first tangent
+            if not fits or (np.isfinite(value) and bound > value + ROUNDING * (abs(value) + unit)):
+                whose = "its own plan" if fits else "its own plan, which breaks hard rows,"
+                raise ContradictionError(contradiction(bound, value, whose))
+        search.still_open = max(search.still_open, min(bound, search.value))
         best_bound = max(best_bound, min(bound, search.value))
         if bound >= search.cutoff:
             search.discard(search.cutoff)
@@ -65,10 +88,15 @@ def outer_approximation(
         if point is None or not finished:
             return False, best_bound
         search.nodes += 1
+        allowed = not search.restricted or satisfied(search.chains, point[None], lower, upper)[0]
         # rounding of the master, or moves that nothing can follow: what they are worth is known, what is left matters
-        if tangents.knows(point) or (search.followed and point.tobytes() in search.seen):
+        if tangents.knows(point) or not allowed or (search.followed and point.tobytes() in search.seen):
             master.forbid(point)
         points = around(search.chains, point, lower, upper)
+
+
+class ContradictionError(Exception):
+    """HiGHS has claimed what a known plan disproves."""
 
 
 class _Tangents:
@@ -93,9 +121,7 @@ class _Tangents:
     def exclude(self, points: np.ndarray, cutoff: float) -> None:
         """Add tangents until the master's bound of all points that the cuts exclude is at the cutoff."""
         points = points[self.cuts.bounds(points) >= cutoff]
-        bounds = np.full(len(points), -np.inf)
-        for tangent in self.list:
-            bounds = np.maximum(bounds, self._bound(tangent, points))
+        bounds = self.values(points)
         for _ in range(TANGENTS):
             if not len(points) or bounds.min() >= cutoff:
                 return
@@ -106,6 +132,20 @@ class _Tangents:
             self.taken.add(point.tobytes())
             self.list.append(self._restricted(*self.cuts.tangent(point)))
             bounds = np.maximum(bounds, self._bound(self.list[-1], points))
+
+    def values(self, points: np.ndarray) -> np.ndarray:
+        """What the master pays for whole moves ``"point integer"``."""
+        values = np.full(len(points), -np.inf)
+        for tangent in self.list:
+            values = np.maximum(values, self._bound(tangent, points))
+        return values
+
+    def witness(self, search: Search, forbidden: set[bytes], lower: np.ndarray, upper: np.ndarray) -> float:
+        """The least value in the master of a solved plan that it may still choose; infinite without one."""
+        keys = [key for key in search.seen if key not in forbidden]
+        points = np.array([np.frombuffer(key, dtype=int) for key in keys]).reshape(len(keys), len(lower))
+        points = points[satisfied(search.chains, points, lower, upper)]
+        return float(self.values(points).min(initial=np.inf)) if self.list else np.inf
 
     def _bound(self, tangent, points) -> np.ndarray:
         value, place, slope = tangent
@@ -135,9 +175,13 @@ def diagonal_share(curvature: np.ndarray) -> np.ndarray:
 
 def _listed(search: Search, model: LowerModel, lower, upper) -> np.ndarray:
     """Candidates below the incumbent; good ones only where there are too many."""
-    found = enumerate_below(model, search.chains, lower, upper, search.cutoff, LISTED)
+    found = enumerate_below(
+        model, search.chains, lower, upper, search.cutoff, LISTED, check_time=search.check_time
+    )
     if found is None:
-        found = enumerate_below(model, search.chains, lower, upper, search.cutoff, None, beam=BEAM)
+        found = enumerate_below(
+            model, search.chains, lower, upper, search.cutoff, None, beam=BEAM, check_time=search.check_time
+        )
     points = np.zeros((0, len(lower)), dtype=int) if found is None else found[0]
     return points[satisfied(search.chains, points, lower, upper)]
 

@@ -19,7 +19,10 @@ from jaxmpc.integer.search import Relaxed, relax
 from jaxmpc.integer.tables import Constants
 from jaxmpc.problem.condense import CondensedQp
 from jaxmpc.problem.instance import QpInstance
+from jaxmpc.problem.layout import Size
+from jaxmpc.programs.clock import Clock
 from jaxmpc.programs.lanes import Lanes, lanes_of
+from jaxmpc.programs.pace import Pace
 from jaxmpc.relaxed.newton import WarmStart
 from jaxmpc.relaxed.solve import cold_start
 
@@ -76,6 +79,16 @@ class Relaxations:
         """Moves and prices of one lane."""
         return jax.tree.map(lambda leaf: leaf[lane], self.warm)
 
+    @classmethod
+    def joined(cls, parts: Sequence[Relaxations]) -> Relaxations:
+        """Batches one after the other."""
+        if len(parts) == 1:
+            return parts[0]
+        fields = (field.name for field in dataclasses.fields(cls))
+        return cls(
+            *(jax.tree.map(lambda *v: np.concatenate(v), *(getattr(p, f) for p in parts)) for f in fields)
+        )
+
     def part(self, begin: int, end: int) -> Relaxations:
         """Some of the lanes."""
         fields = (getattr(self, field.name) for field in dataclasses.fields(self))
@@ -97,8 +110,11 @@ class LaneLimits(NamedTuple):
 
 
 @jax.jit
-def _relax(qps: Lanes, instances: QpInstance, index, limits: LaneLimits, starts, count) -> Relaxed:
-    """Relaxations of lanes that belong to the scenarios `index`; those from `count` on are not solved."""
+def _relax(qps: Lanes, instances: QpInstance, index, limits: LaneLimits, starts, count, most) -> Relaxed:
+    """Relaxations of lanes that belong to the scenarios `index`; those from `count` on are not solved.
+
+    Each is solved in `most` Newton steps at most.
+    """
     pick = lambda tree: jax.tree.map(lambda leaf: leaf[index], tree)  # noqa: E731
 
     def lane(own, instance, limits: LaneLimits, start, there):
@@ -106,10 +122,15 @@ def _relax(qps: Lanes, instances: QpInstance, index, limits: LaneLimits, starts,
         low, high = (jnp.where(there, v, 0.0) for v in (limits.lower, limits.upper))
         rows = limits.row_low, limits.row_high
         instance = eqx.tree_at(lambda i: (i.row_low, i.row_high), instance, rows)
-        return relax(eqx.combine(own, qps.shared), instance, low, high, start)
+        return relax(eqx.combine(own, qps.shared), instance, low, high, start, most=most)
 
     there = jnp.arange(LANES) < count
     return jax.vmap(lane)(pick(qps.each), pick(instances), limits, starts, there)
+
+
+def pace_of(size: Size) -> Pace:
+    """Of relaxations of a size, before the first is solved."""
+    return Pace(size.moves, size.cvs * size.horizon)
 
 
 class Relaxer:
@@ -118,16 +139,18 @@ class Relaxer:
     Args:
         qps: constant parts of their problems, shared or per scenario.
         constants: one per scenario, or a single one that all scenarios share.
+        pace: of these relaxations as far as it is known.
     """
 
-    def __init__(self, qps: Lanes, constants: Sequence[Constants]):
+    def __init__(self, qps: Lanes, constants: Sequence[Constants], pace: Pace | None = None):
         self.qps, self.constants = jax.tree.map(jnp.asarray, qps), constants
+        self.pace = pace_of(constants[0].size) if pace is None else pace
 
     def part(self, index: np.ndarray) -> Relaxer:
         """The relaxations of some scenarios; nothing is computed again."""
         if len(self.constants) == 1:
             return self
-        return Relaxer(self.qps.take(index), [self.constants[i] for i in index])
+        return Relaxer(self.qps.take(index), [self.constants[i] for i in index], self.pace)
 
     def with_chords(self, index: int) -> Relaxer:
         """The relaxations of one scenario whose positions pay along chords what they can (`tighten`)."""
@@ -137,7 +160,7 @@ class Relaxer:
         values = qp.hessian - qp.rows.square(jnp.asarray(2.0 * weight)), jnp.asarray(weight)
         fields = lambda qp: (qp.hessian, qp.position_weight)  # noqa: E731
         tight = eqx.tree_at(fields, qp, values, is_leaf=lambda leaf: leaf is None)
-        return Relaxer(lanes_of([tight]), [constants])
+        return Relaxer(lanes_of([tight]), [constants], self.pace)
 
     def problem(self, index: int) -> CondensedQp:
         """Constant part of a scenario's problems."""
@@ -153,6 +176,7 @@ class Relaxer:
         index: np.ndarray,
         limits: LaneLimits,
         starts: WarmStart,
+        most: float = np.inf,
     ) -> Relaxations:
         """Solve relaxed problems.
 
@@ -161,16 +185,20 @@ class Relaxer:
             index: scenario of each lane.
             limits: of every lane, in place of those of its scenario.
             starts: moves and prices to start from, ``"lane"``.
+            most: Newton steps of a lane after which it is judged as it is; none evaluate the moves it starts from.
         """
         count, parts = len(index), []
         for begin in range(0, count, LANES):
             pad = np.minimum(begin + np.arange(LANES), count - 1)
             some = jax.tree.map(lambda leaf, pad=pad: leaf[pad], (index, limits, starts))
             used = min(LANES, count - begin)
-            solved = _relax(self.qps, instances, *some, used)
-            parts.append(jax.tree.map(lambda leaf, used=used: np.asarray(leaf)[:used], solved))
-        join = lambda *leaves: leaves[0] if len(leaves) == 1 else np.concatenate(leaves)  # noqa: E731
-        return Relaxations.of(jax.tree.map(join, *parts))
+            clock = Clock()
+            solved = _relax(self.qps, instances, *some, used, most)
+            own = jax.tree.map(lambda leaf, used=used: np.asarray(leaf)[:used], solved)
+            parts.append(Relaxations.of(own))
+            if most > 0:
+                self.pace.took(clock.seconds, int(parts[-1].steps.sum()), used)
+        return Relaxations.joined(parts)
 
     def cold(self, instances: QpInstance) -> WarmStart:
         """Starts that know nothing, one per scenario."""
@@ -179,9 +207,9 @@ class Relaxer:
         start = jax.tree.map(np.asarray, cold_start(self.problem(0), one))
         return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape)), start)
 
-    def solve_roots(self, instances: QpInstance, warm: WarmStart) -> Relaxations:
-        """Relaxations of all scenarios themselves, within their own limits."""
+    def solve_roots(self, instances: QpInstance, warm: WarmStart, most: float = np.inf) -> Relaxations:
+        """Relaxations of all scenarios themselves, within their own limits; `most` as in `solve`."""
         index = np.arange(len(instances.lower))
         own = (instances.lower, instances.upper, instances.row_low, instances.row_high)
         limits = LaneLimits(*map(np.asarray, own))
-        return self.solve(instances, index, limits, jax.tree.map(np.asarray, warm))
+        return self.solve(instances, index, limits, jax.tree.map(np.asarray, warm), most)

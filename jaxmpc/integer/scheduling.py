@@ -7,16 +7,20 @@ few compiled calls; a scenario that is done drops out and costs nothing more.
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import os
 
 import jax
 import numpy as np
 
 from jaxmpc.integer.host_search import Offload, Request, Search, SearchResult, Steps
-from jaxmpc.integer.relaxer import Relaxer
+from jaxmpc.integer.relaxer import LANES, Relaxations, Relaxer
 from jaxmpc.problem.instance import QpInstance
 from jaxmpc.programs.clock import Clock
 from jaxmpc.programs.interrupts import being_left
+from jaxmpc.programs.progress import Seen, watched
+from jaxmpc.relaxed.newton import MOST_STEPS
+from jaxmpc.status import OPTIMAL
 
 
 class _Run:
@@ -53,11 +57,27 @@ def run(
         Their results, in the same order.
     """
     runs = [_Run(*entry) for entry in searches]
+    if any(search.time_limit is not None for _, search, _ in searches):
+        return _run(relaxer, instances, runs)
+    before = [search.spent for _, search, _ in searches]
+
+    def seen(seconds: float) -> Seen:
+        k = next((k for k, one in enumerate(runs) if one.result is None), len(runs) - 1)
+        return runs[k].search.seen_after(before[k] + seconds)
+
+    with watched(seen) if runs else contextlib.nullcontext():
+        return _run(relaxer, instances, runs)
+
+
+def _run(relaxer: Relaxer, instances: QpInstance, runs: list[_Run]) -> list[SearchResult]:
+    """Run searches to their ends."""
     for one in runs:
         one.send(None)
     pool = None
     try:
         while any(one.result is None for one in runs):
+            clock, active = Clock(), [one for one in runs if one.result is None]
+            charged = sum(one.search.spent for one in active)
             for one in runs:
                 if isinstance(one.waits, Offload) and one.future is None:
                     if pool is None:
@@ -78,6 +98,10 @@ def run(
                     one.future = None
                     one.search.spent += seconds
                     one.send(value)
+            # what was charged to nobody is what it takes to serve them
+            served = clock.seconds - (sum(one.search.spent for one in active) - charged)
+            for one in active:
+                one.search.spent += max(served, 0.0) / len(active)
     finally:
         if pool is not None:
             pool.shutdown(wait=not being_left(), cancel_futures=True)
@@ -90,21 +114,66 @@ def _timed(work):
 
 
 def _answer(relaxer: Relaxer, instances: QpInstance, asking: list[_Run]) -> None:
-    """Solve what these searches wait for in shared batches, charge each for its lanes, and go on with them."""
-    requests = [one.waits for one in asking if isinstance(one.waits, Request)]
-    counts = [len(request.limits.lower) for request in requests]
-    index = np.repeat([one.number for one in asking], counts)
+    """Solve what these searches wait for, and go on with them; those whose time limit is far share batches."""
+    together = []
+    for one in asking:
+        request, left = one.waits, one.search.seconds_left()
+        assert isinstance(request, Request)
+        count = len(request.limits.lower)
+        if left is None or relaxer.pace.steps_within(left / count) >= MOST_STEPS:
+            together.append((one, request))
+        else:
+            one.send(_solved_in_time(relaxer, instances, one, request))
+    if together:
+        _solve_together(relaxer, instances, together)
+
+
+def _solve_together(relaxer: Relaxer, instances: QpInstance, some: list[tuple[_Run, Request]]) -> None:
+    """Requests of searches in shared batches, each charged for its lanes."""
+    counts = [len(request.limits.lower) for _, request in some]
+    index = np.repeat([one.number for one, _ in some], counts)
     join = lambda *leaves: leaves[0] if len(leaves) == 1 else np.concatenate(leaves)  # noqa: E731
     clock = Clock()
     result = relaxer.solve(
         instances,
         index,
-        jax.tree.map(join, *(request.limits for request in requests)),
-        jax.tree.map(join, *(request.starts for request in requests)),
+        jax.tree.map(join, *(request.limits for _, request in some)),
+        jax.tree.map(join, *(request.starts for _, request in some)),
     )
     per_lane = clock.seconds / len(index)
     first = 0
-    for one, count in zip(asking, counts, strict=True):
+    for (one, _), count in zip(some, counts, strict=True):
         one.search.spent += per_lane * count
         one.send(result.part(first, first + count))
         first += count
+
+
+def _solved_in_time(
+    relaxer: Relaxer, instances: QpInstance, one: _Run, request: Request
+) -> Relaxations | None:
+    """As many of the lanes, the first ones, as are solved before the time limit of their search."""
+    search, count, done = one.search, len(request.limits.lower), 0
+    some = lambda begin, end: jax.tree.map(lambda leaf: leaf[begin:end], (request.limits, request.starts))  # noqa: E731
+    parts = []
+    while done < count:
+        left = search.seconds_left()
+        assert left is not None
+        lanes = min(count - done, LANES)
+        if not request.evaluated:
+            lanes = min(lanes, relaxer.pace.lanes_within(left))
+        if not lanes:
+            break
+        most = 0.0 if request.evaluated else relaxer.pace.steps_within(left / lanes)
+        clock = Clock()
+        result = relaxer.solve(instances, np.full(lanes, one.number), *some(done, done + lanes), most)
+        search.spent += clock.seconds
+        # a lane that the clock has stopped proves little, but its moves may be good
+        stopped = (result.steps >= most) & (result.status != OPTIMAL) & (not request.evaluated)
+        good = int(np.argmax(stopped)) if stopped.any() else lanes
+        for lane in range(good, lanes):
+            search.offer(result, lane)
+        parts.append(result.part(0, good))
+        done += good
+        if stopped.any() and lanes == 1:
+            break
+    return Relaxations.joined(parts) if parts else None

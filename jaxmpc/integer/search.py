@@ -4,7 +4,8 @@ One loop carries what to solve next: first the problem itself, then its rounded 
 list. The prices of the root leave a list of whole moves that may be better than the incumbent (`lower_bound`,
 `listing`), and the best of the list are solved one after the other, each with a quadratic cut that bounds all others
 (`cuts`), until none is left. What does not fit (moves of more than one step, rounded moves that break a hard row, longer
-lists) is left to `integer.solve`, which goes on from the relaxation.
+lists) is left to `integer.solve`, which goes on from the relaxation; so are whole moves that must keep more than limits and
+hard rows (`actuators`).
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmpc.integer import listing
@@ -29,6 +31,7 @@ from jaxmpc.status import OPTIMAL, finisher_code
 
 MOST_SOLVED = 64  # of a list
 CUT_BLOCK = 256  # entries of a list that are cut together
+LISTING = 10.0  # blocks of a list that are extended, or cut, while one Newton step is taken
 ROW_ROUNDING = 1e-6  # slack of the hard rows of rounded moves, which are whole numbers themselves
 
 
@@ -52,10 +55,16 @@ class Relaxed(NamedTuple):
 
 
 def relax(
-    qp: CondensedQp, instance: QpInstance, lower, upper, start: WarmStart, integers: bool = True
+    qp: CondensedQp,
+    instance: QpInstance,
+    lower,
+    upper,
+    start: WarmStart,
+    integers: bool = True,
+    most: Array | float = jnp.inf,
 ) -> Relaxed:
     """Relax one problem within limits of the moves, and evaluate its moves with the integer ones, if any, rounded."""
-    s = solve_lane(qp, instance, lower, upper, start)
+    s = solve_lane(qp, instance, lower, upper, start, most)
     if not integers:
         return Relaxed(warm_start_of(s), s.objective, s.bound, s.objective, s.status, s.iterations)
     snapped = jnp.where(qp.whole, jnp.round(s.x), s.x)
@@ -70,9 +79,9 @@ class Decision(NamedTuple):
     """What a search found.
 
     Attributes:
-        closed: whether it is proven; nothing else but the root counts otherwise.
-        x: the moves, scaled.
-        value, bound: objective, and what no whole moves are below.
+        closed: whether it is proven.
+        x: the moves, scaled; the best that were found where it is not.
+        value, bound: objective, and what no whole moves are below; true where nothing is closed, too.
         finished_by: code of `status.FINISHERS`.
         nodes: relaxations solved with whole moves, 1 where the root was enough.
         steps: Newton steps.
@@ -102,6 +111,8 @@ class _State(NamedTuple):
     value: Array
     x: Array
     left_out: Array
+    complete: Array
+    work: Array
     solved: Array
     steps: Array
     finished_by: Array
@@ -112,7 +123,12 @@ class _State(NamedTuple):
 
 @one_by_one
 def decide(
-    qp: CondensedQp, tables: Tables, instance: QpInstance, start: WarmStart, gap: Float[Array, ""]
+    qp: CondensedQp,
+    tables: Tables,
+    instance: QpInstance,
+    start: WarmStart,
+    gap: Float[Array, ""],
+    most: Float[Array, ""] | float = jnp.inf,
 ) -> Decision:
     """Relax and search one step (use `jax.vmap` for a batch).
 
@@ -122,14 +138,18 @@ def decide(
         instance: the problem of this sample.
         start: where the relaxation begins.
         gap: relative gap at which a solve is optimal.
+        most: Newton steps of all its relaxations, or as much other work, after which it gives up.
     """
-    search = _Search(qp, tables, instance, jnp.asarray(gap, dtype=float))
+    search = _Search(qp, tables, instance, jnp.asarray(gap, dtype=float), jnp.asarray(most, dtype=float))
 
     def visit(state: _State) -> _State:
         """Solve what is next, and choose what to solve after it."""
         integers = tables.column.shape[0] > 0
-        result = relax(qp, instance, state.lower, state.upper, state.root.warm, integers)
-        state = state._replace(solved=state.solved + 1, steps=state.steps + result.steps)
+        left = jnp.maximum(search.most - state.work, 0.0)
+        result = relax(qp, instance, state.lower, state.upper, state.root.warm, integers, left)
+        state = state._replace(
+            solved=state.solved + 1, steps=state.steps + result.steps, work=state.work + result.steps
+        )
         if not integers:
             return search.begun(state, result)
         return jax.lax.cond(state.solved == 1, search.begun, search.after, state, result)
@@ -137,6 +157,7 @@ def decide(
     state = jax.lax.while_loop(lambda state: state.open, visit, search.start(start))
     left_out = jnp.minimum(state.left_out, jnp.min(state.bounds))
     root_bound = jnp.maximum(state.root.bound, 0.0)
+    left_out = jnp.where(state.complete, left_out, -jnp.inf)
     bound = jnp.minimum(jnp.maximum(left_out, root_bound), state.value)
     closed = ~state.given_up & closes(state.value, bound, tables.scale, search.gap)
     return Decision(
@@ -158,6 +179,7 @@ class _Search(NamedTuple):
     tables: Tables
     instance: QpInstance
     gap: Array
+    most: Array
 
     @property
     def none(self) -> Array:
@@ -190,6 +212,8 @@ class _Search(NamedTuple):
             value=infinite,
             x=jnp.zeros_like(self.instance.lower),
             left_out=infinite,
+            complete=no,
+            work=number,
             solved=whole,
             steps=whole,
             finished_by=whole,
@@ -207,23 +231,29 @@ class _Search(NamedTuple):
         """The relaxation is known: it may be whole already; if not, its rounded moves come next."""
         low, high = self.limits
         bound = jnp.maximum(root.bound, 0.0)  # every term of (6.6) is non-negative
-        value = jnp.where(self.none, root.objective, root.snapped)
+        # the envelope of squared moves is exact up to as many steps as it has levels, and a bound beyond them
+        levels = self.qp.steep.shape[0] or np.inf
+        exact = jnp.all(~self.qp.whole | (jnp.abs(root.warm.x) < levels + 0.5))
+        value = jnp.where(self.none, root.objective, jnp.where(exact, root.snapped, jnp.inf))
         found = jnp.isfinite(root.warm.x).all() & jnp.isfinite(root.bound)
         closed = jnp.where(
             self.none,
             root.status == OPTIMAL,
             closes(value, jnp.minimum(bound, value), self.tables.scale, self.gap),
         )
+        if self.tables.complete is not None:  # what else there is to keep is known on the host only
+            closed &= self.tables.complete | self.none
         first = jnp.clip(jnp.round(self.of(root.warm.x)), low, high)
         usable = found & self.tables.known & ~self.none
         usable &= jnp.all((low >= -1.0) & (high <= 1.0) & (low <= high))
         limits = listing.position_limits(self.tables, self.instance)
-        usable &= fits(self.tables, limits, first[None])[0]
+        usable &= fits(self.tables, limits, first[None])[0] & (state.work < self.most)
         state = state._replace(
             value=value,
             x=jnp.where(self.qp.whole, jnp.round(root.warm.x), root.warm.x),
             finished_by=jnp.where(closed, finisher_code("relaxation"), 0),
             left_out=jnp.where(closed, bound, jnp.inf),
+            complete=closed,
             open=usable & ~closed,
             given_up=~closed & ~usable,
             root=root,
@@ -251,11 +281,12 @@ class _Search(NamedTuple):
         best = jnp.argmin(state.bounds)
         limit = cutoff(state.value, self.tables.scale, self.gap)
         going = (state.bounds[best] < limit) & ~state.given_up
-        too_many = state.solved > MOST_SOLVED
+        too_many = (state.solved > MOST_SOLVED) | (state.work >= self.most)
+        going_on = going & ~too_many
         state = state._replace(
             expected=state.bounds[best],
-            bounds=state.bounds.at[best].set(jnp.where(going, jnp.inf, state.bounds[best])),
-            open=going & ~too_many,
+            bounds=state.bounds.at[best].set(jnp.where(going_on, jnp.inf, state.bounds[best])),
+            open=going_on,
             given_up=state.given_up | (going & too_many),
         )
         return self.next(state, jnp.where(going, decode(state.codes[best], len(state.point)), state.point))
@@ -298,7 +329,7 @@ class _Search(NamedTuple):
             [
                 Listed.empty,
                 lambda: listing.grid_below(tables, limits, kept, sizes, limit),
-                lambda: listing.list_below(tables, limits, kept, limit),
+                lambda: listing.list_below(tables, limits, kept, limit, LISTING * (self.most - state.work)),
             ],
         )
         fixed = empty | (jnp.max(sizes) == 1)
@@ -312,6 +343,8 @@ class _Search(NamedTuple):
             bounds=jnp.where(found.codes == encode(state.point), jnp.inf, found.bounds),
             count=jnp.minimum(found.count, listing.LONGEST),
             left_out=jnp.minimum(state.left_out, jnp.where(closed, root_bound, limit)),
+            complete=found.count <= listing.LONGEST,
+            work=state.work + found.looked_at / LISTING,
             finished_by=by,
             given_up=(found.count > listing.LONGEST) | ~jnp.isfinite(state.value),
         )
@@ -335,4 +368,4 @@ class _Search(NamedTuple):
             return begin + CUT_BLOCK, jax.lax.dynamic_update_slice(bounds, new, (begin,))
 
         _, bounds = jax.lax.while_loop(lambda carry: carry[0] < state.count, more, (0, state.bounds))
-        return state._replace(bounds=bounds)
+        return state._replace(bounds=bounds, work=state.work + state.count / (CUT_BLOCK * LISTING))

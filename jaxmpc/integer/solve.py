@@ -10,11 +10,13 @@ incumbent, lower bound, gap. `plan` and the mixed-integer controllers call this 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 
 import jax
 import numpy as np
 
+from jaxmpc.integer.actuators import Actuator
 from jaxmpc.integer.branch_and_bound import branch_and_bound
 from jaxmpc.integer.cuts import Cuts
 from jaxmpc.integer.enumeration import enumerate_all
@@ -27,9 +29,18 @@ from jaxmpc.integer.feasible import (
     satisfied,
     whole,
 )
-from jaxmpc.integer.host_search import GROUP, Search, SearchResult, Steps
+from jaxmpc.integer.host_search import (
+    GROUP,
+    NOT_CLOSED,
+    Known,
+    OutOfTimeError,
+    Search,
+    SearchResult,
+    Steps,
+    no_whole_moves,
+)
 from jaxmpc.integer.lower_bound import LowerModel, enumerate_below, exclude
-from jaxmpc.integer.outer_approximation import outer_approximation
+from jaxmpc.integer.outer_approximation import ContradictionError, outer_approximation
 from jaxmpc.integer.relaxer import Relaxations, Relaxer
 from jaxmpc.integer.scheduling import run
 from jaxmpc.problem.blocking import moves_per_block
@@ -37,10 +48,9 @@ from jaxmpc.problem.instance import QpInstance
 from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure
 from jaxmpc.relaxed.gap import closes
-from jaxmpc.status import INFEASIBLE, OPTIMAL
+from jaxmpc.status import OPTIMAL
 
 BEAM = 64  # partial candidates kept while looking for good first moves
-UNINTERRUPTED = 0.05  # time limits from which on a search may run as one compiled call [s]
 FINISHES = ("auto", "enumeration", "highs", "branch-and-bound")
 
 
@@ -50,11 +60,13 @@ def solve_integers(
     root: Relaxations,
     *,
     starts: Sequence[Sequence[np.ndarray]],
+    actuators: Sequence[Sequence[Actuator]] = (),
     gap: float = 1e-6,
     time_limit: float | None = None,
     finish: str = "auto",
     last: bool = True,
-    spent: float = 0.0,
+    spent: Sequence[float] | np.ndarray | None = None,
+    known: Sequence[Known] | None = None,
 ) -> list[SearchResult]:
     """Search the problems of many scenarios side by side on the host.
 
@@ -63,25 +75,34 @@ def solve_integers(
         instances: their problems, first axis ``"scenario"``, with NumPy's arrays.
         root: their relaxations.
         starts: integer moves to try as incumbents, per scenario ``"integer"`` [steps]; they never change the answer.
+        actuators: what the integer MVs must keep besides limits and rows, per scenario; none if that is all.
         gap: relative gap at which a solve stops.
         time_limit: seconds of work per scenario; the best plan so far is returned with its true gap.
         finish: ``auto``, or the one path that has to close the problems after fixing.
         last: whether to go on where lists are too long and chords would tighten the relaxation.
-        spent: seconds that every scenario has taken already.
+        spent: seconds that the scenarios have taken already, none if not given.
+        known: plans and bounds of the scenarios that others have found.
 
     Returns:
         One result per scenario; ``status.INFEASIBLE`` when no whole moves satisfy the hard limits.
     """
     results: list[SearchResult | None] = [None] * len(instances.lower)
-    searches = []
+    searches, spent = [], np.zeros(len(results)) if spent is None else spent
     for i in range(len(results)):
         bound, value = max(float(root.bound[i]), 0.0), float(root.snapped[i])
-        if finish == "auto" and closes(value, bound, relaxer.scenario(i).scale, gap):
-            results[i] = _closed_by_root(relaxer, root, i, bound, spent)
+        closed = finish == "auto" and closes(value, bound, relaxer.scenario(i).scale, gap)
+        if closed and not actuators:
+            results[i] = _closed_by_root(relaxer, root, i, bound, float(spent[i]))
             continue
         own = jax.tree.map(lambda leaf, i=i: leaf[i], instances)
-        search = Search(relaxer.scenario(i), own, root.part(i, i + 1), gap, time_limit)
-        search.spent = spent
+        rest = actuators[i] if actuators else ()
+        search = Search(relaxer.scenario(i), own, root.part(i, i + 1), gap, time_limit, rest)
+        if closed and search.allows(root.x[i]):
+            results[i] = _closed_by_root(relaxer, root, i, bound, float(spent[i]))
+            continue
+        search.spent = float(spent[i])
+        if known is not None:
+            search.take(known[i])
         searches.append((i, search, _line(search, starts[i], finish, last)))
     done = run(relaxer, instances, searches)
     for (i, search, _), result in zip(searches, done, strict=True):
@@ -102,12 +123,30 @@ def _closed_by_root(
 
 
 def _line(search: Search, starts: Sequence[np.ndarray], finish: str, last: bool) -> Steps:
-    """The whole line of one solve, from its relaxation on; returns `SearchResult`."""
+    """One solve, from its relaxation on, up to its end or that of its time; returns `SearchResult`."""
+    result = None
+    if not search.out_of_time():
+        with contextlib.suppress(OutOfTimeError):
+            result = yield from _stages(search, starts, finish, last)
+    if result is not None and (result.x is not None or not search.out_of_time()):
+        return result
+    if search.x is None:
+        yield from search.salvaged(starts)
+    return search.finish(None, search.still_open)
+
+
+def _stages(search: Search, starts: Sequence[np.ndarray], finish: str, last: bool) -> Steps:
+    """The whole line of one solve; returns `SearchResult`.
+
+    Raises:
+        OutOfTimeError: where its time is used up inside a stage.
+    """
     c, root, root_bound = search.constants, search.root, search.root_bound
     integer = c.integer
     low, high = whole(search.limits[0][integer]), whole(search.limits[1][integer])
-    infeasible = SearchResult(None, np.inf, np.inf, INFEASIBLE, None, 0)
+    infeasible = no_whole_moves()
     if not (np.isfinite(root.x).all() and np.isfinite(root.bound).all()):
+        search.reason = "the relaxation was not solved: its numbers are not finite"
         return search.finish(None, root_bound)
     model, lower, upper = search.lower_model(root, 0, low, high), low, high
     own = MoveLimits(low, high, *position_limits(search.chains))
@@ -118,10 +157,11 @@ def _line(search: Search, starts: Sequence[np.ndarray], finish: str, last: bool)
         try:
             point = _repaired(search, model, lower, upper) if possible else None
         except UndecidedError:
+            search.reason = "whether any whole moves satisfy the hard limits would take too long to find out"
             return search.finish(None, root_bound)
         if point is None:
             return infeasible
-    cuts = Cuts(c)
+    cuts = Cuts(c, search.check_time)
     cuts.add(root, 0, low, high)
     search.offer(root, 0)
     yield from _solve_all(search, cuts, [point])
@@ -141,7 +181,7 @@ def _line(search: Search, starts: Sequence[np.ndarray], finish: str, last: bool)
             return search.finish("fixing" if finish == "auto" else finish, np.inf)
         if (lower == upper).all() and finish == "auto":
             only = search.new([lower])
-            if len(only):
+            if len(only) and satisfied(search.chains, only, lower, upper)[0]:
                 yield from search.evaluate(only)
             return search.finish("fixing", np.inf)
     if finish in ("auto", "enumeration"):
@@ -150,14 +190,19 @@ def _line(search: Search, starts: Sequence[np.ndarray], finish: str, last: bool)
         if not done and not search.out_of_time():  # better incumbents make the list shorter
             yield from _solve_all(search, cuts, _candidates(search, model, starts, lower, upper))
             done = yield from enumerate_all(search, model, cuts, lower, upper, limited=limited)
+        search.reason = "the list of whole moves that may be better is longer than what is kept in memory"
         if done or finish == "enumeration" or search.out_of_time():
             return search.finish("enumeration" if done else None, np.inf if done else root_bound)
-    if not last and c.chord_weight.any():
+    search.reason = NOT_CLOSED
+    if not last and search.may_tighten():
         return search.finish(None, root_bound)
     if finish == "highs":
         seconds = search.seconds_left()
-        done, bound = yield from outer_approximation(search, model, cuts, lower, upper, seconds)
-        return search.finish("highs" if done else None, max(root_bound, min(bound, search.value)))
+        with contextlib.suppress(ContradictionError):
+            done, bound = yield from outer_approximation(search, model, cuts, lower, upper, seconds)
+            search.reason = "HiGHS has ended without a proof"
+            return search.finish("highs" if done else None, max(root_bound, min(bound, search.value)))
+        search.still_open = -np.inf  # nothing that HiGHS has said is believed any more
     bound = yield from branch_and_bound(search, root, model, cuts, lower, upper, root_bound)
     return search.finish("branch-and-bound", bound)
 
@@ -183,7 +228,9 @@ def _repaired(search: Search, model: LowerModel, lower: np.ndarray, upper: np.nd
 
 def _best_by_model(search: Search, model: LowerModel, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     """Whole moves that satisfy the hard rows, the cheapest by the model first, ``"point integer"``."""
-    found = enumerate_below(model, search.chains, lower, upper, np.inf, None, beam=BEAM)
+    found = enumerate_below(
+        model, search.chains, lower, upper, np.inf, None, beam=BEAM, check_time=search.check_time
+    )
     points = np.zeros((0, len(lower)), dtype=int) if found is None else found[0]
     return points[satisfied(search.chains, points, lower, upper)]
 

@@ -40,6 +40,7 @@ class Tables(eqx.Module):
         slope: of the envelope of every move.
         own_weight: see `cuts`.
         scale: see `gap.closes`.
+        complete: whether limits and hard rows are all that whole moves must keep; None where that is so in every lane.
     """
 
     count: Int[Array, ""]
@@ -56,6 +57,7 @@ class Tables(eqx.Module):
     slope: Float[Array, "level integer"]
     own_weight: Float[Array, " integer"]
     scale: Float[Array, ""]
+    complete: Bool[Array, ""] | None = None
 
 
 class Constants:
@@ -96,7 +98,7 @@ class Constants:
             ) from None
         self.slope = np.asarray(qp.steep)[:, self.integer]  # of the envelope
         self.knot = np.arange(len(self.slope), dtype=float)[:, None]
-        self.scale = max(float(np.diag(curvature).max()), 1e-12)
+        self.scale = float(qp.unit)
         self.own_weight = 0.5 * (np.diag(curvature) - np.diag(hessian))[self.integer]
         # hard rows of the positions of the integer MVs, and these positions as sums of the whole moves
         self.position = self.mv * size.rows + self.block
@@ -111,8 +113,19 @@ class Constants:
     @functools.cached_property
     def chord_weight(self) -> Float[np.ndarray, " position"]:
         """Curvature of the positions that chords may pay (`tighten`), made when first needed."""
-        back = np.linalg.inv(self.reached)
-        return chord_weights(back.T @ self.schur @ back)
+        found = self.chords_within(None)
+        assert found is not None
+        return found
+
+    def chords_within(self, seconds: float | None) -> Float[np.ndarray, " position"] | None:
+        """`chord_weight` if it is known or made in so many seconds (None for no limit), else None."""
+        if "chord_weight" not in self.__dict__:
+            back = np.linalg.inv(self.reached)
+            found = chord_weights(back.T @ self.schur @ back, seconds)
+            if found is None:
+                return None
+            self.__dict__["chord_weight"] = found
+        return self.chord_weight
 
     def of_chords(self, price: np.ndarray, at: np.ndarray) -> tuple[float, np.ndarray]:
         """What prices of chords add to a lower bound with all curvature: its value and its gradient at moves.
@@ -131,11 +144,15 @@ class Constants:
         value = (weight * w**2 - own * w + own * k - weight * k**2).sum()
         return float(value), self.reached.T @ (2.0 * weight * w - own)
 
-    def tables(self, integers: int) -> Tables:
-        """For the compiled search, with room for so many integer moves."""
+    def tables(self, integers: int, restricted: bool = False) -> Tables:
+        """For the compiled search, with room for so many integer moves.
+
+        Args:
+            restricted: whether in any lane there is more to keep than limits and hard rows.
+        """
         structure, size, order = self.structure, self.size, self.order
         count, room = len(order), integers - len(order)
-        known = room >= 0 and structure.mean_move_mode != "predictive"
+        known = room >= 0 and structure.mean_move_mode != "predictive" and not structure.has_gaps_or_dwell
         if not known:
             order, count, room = order[:integers], min(count, integers), max(room, 0)
         place, previous = self.position, self._before(self.block[:, None] - 1 == self.block[None, :])
@@ -164,6 +181,7 @@ class Constants:
             slope=np.pad(self.slope[:, order], ((0, 0), (0, room))),
             own_weight=padded(one(self.own_weight)),
             scale=np.asarray(self.scale),
+            complete=np.asarray(not structure.has_gaps_or_dwell) if restricted else None,
         )
         return Tables(**fields)
 

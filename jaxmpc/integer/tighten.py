@@ -13,6 +13,7 @@ the relaxation is for positions that are anywhere.
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -20,18 +21,30 @@ from jaxtyping import Float
 
 LEAST = 1e-2  # of the curvature of a position: shares below it tighten next to nothing and leave the objective flatter
 SHARE = 0.9  # of what could be moved: the rest keeps the objective curved, so that few Newton steps solve it
+SECONDS, LOADING = (
+    6e-7,
+    1.0,
+)  # what the programme takes by the fourth power of the positions; loading its solver
+TIMES = 4.0  # share of the time left that it may take is the inverse: the search needs the rest
 SAFE = 1e-9  # share of the curvature that stays, so that rounding leaves the objective convex
 
 
-def chord_weights(curvature: Float[np.ndarray, "position position"]) -> Float[np.ndarray, " position"]:
+def chord_weights(
+    curvature: Float[np.ndarray, "position position"], seconds: float | None = None
+) -> Float[np.ndarray, " position"] | None:
     """The curvature of each position that chords may pay, of largest sum [objective per squared step].
 
     Args:
         curvature: of the objective in the positions, positive semidefinite; 1/2 w'S w.
+        seconds: that are left for the whole search, None for no limit; the programme is not begun where it takes too many.
 
     Returns:
-        D; zeros where there is nothing to gain.
+        D; zeros where there is nothing to gain; None where the time does not suffice.
     """
+    if seconds is not None:
+        expected = SECONDS * len(curvature) ** 4 + (0.02 if "clarabel" in sys.modules else LOADING)
+        if seconds < TIMES * expected:
+            return None
     import clarabel  # here, because few problems come so far
     import scipy.sparse as sp
 
@@ -57,8 +70,12 @@ def chord_weights(curvature: Float[np.ndarray, "position position"]) -> Float[np
     cones = [solver.PSDTriangleConeT(count), solver.NonnegativeConeT(count)]
     settings = solver.DefaultSettings()
     settings.verbose = False
+    if seconds is not None:
+        settings.time_limit = 0.5 * seconds
     none = sp.csc_matrix((count, count))
     solution = solver.DefaultSolver(none, -worth, constraints, values, cones, settings).solve()
+    if seconds is not None and solution.status == solver.SolverStatus.MaxTime:
+        return None
     found = np.asarray(solution.x)
     if not np.isfinite(found).all():
         return nothing

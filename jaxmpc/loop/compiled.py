@@ -24,13 +24,12 @@ from jaxmpc.controller.sample import Sample
 from jaxmpc.programs.clock import Clock
 from jaxmpc.programs.compilation import compiling_for
 from jaxmpc.programs.lanes import Lanes
+from jaxmpc.programs.pace import CALL
 from jaxmpc.programs.packing import Packing, flattened, rebuilt
 from jaxmpc.programs.threads import parts_of, side_by_side
-from jaxmpc.relaxed.gap import FINEST
 
 LONGEST = 64  # samples of one call
 TOGETHER = 16  # scenarios of one call, on a CPU
-APART = 5  # Newton steps that take as long as the rest of a sample
 
 
 class Now(NamedTuple):
@@ -119,9 +118,7 @@ class _Run:
         self.inputs = np.concatenate([together, np.repeat(together[:, -1:], LONGEST + 1, axis=1)], axis=1)
         leaves, self.form = flattened((controllers.cores, plants))
         self.leaves = leaves if place is None else jax.device_put(leaves, place)
-        gap = np.full(self.count, max(controllers.gap, FINEST))
-        search = np.full(self.count, float(controllers.searching))
-        self.settings = np.stack([gap, search, inputs.told.astype(float)], axis=1)
+        self.told = inputs.told.astype(float)
 
     def start(self) -> Any:
         """The packed `Now` before the first sample."""
@@ -132,7 +129,7 @@ class _Run:
         cv = outputs.cv + self.inputs[:, 0, cvs : 2 * cvs]
         rows = np.zeros((self.count, c.size.future, cvs))
         sample = Sample(cv, rows, mv, np.zeros(mv.shape, dtype=bool))
-        shapes = jax.eval_shape(considered, c.cores, state, sample, self.settings[:, :2])
+        shapes = jax.eval_shape(considered, c.cores, state, sample, c.settings)
         moment = jax.tree.map(lambda v: np.zeros(v.shape, v.dtype), shapes)._replace(state=state)
         no: Any = np.zeros(self.count, dtype=bool)
         now = Now(moment, plant_state, cv, mv, np.zeros_like(moment.decision.x), no, no)
@@ -158,7 +155,8 @@ class _Run:
             ``(packed, seen, done, count, decided)``: the sample measured last, fields of what was measured since and of what
             was carried out, how many samples were measured, and whether all scenarios of the last one are decided.
         """
-        given = (packed, self.inputs[:, begin : begin + LONGEST + 1], self.settings)
+        settings = np.concatenate([self.controllers.settings, self.told[:, None]], axis=1)
+        given = (packed, self.inputs[:, begin : begin + LONGEST + 1], settings)
         given = given if self.place is None else jax.device_put(given, self.place)
         packed, rows, (count, decided) = _stride(self.leaves, *given, most, self.form, self.of_now)
         seen, done = jax.tree.map(np.asarray, rows)
@@ -180,13 +178,15 @@ class _Run:
             first, carried, acted = done + acted, count - 1 + acted, 1
             for name, values in doings.items():
                 self._put(fields, name, done, values[:, :carried])
-            work = seen["steps"][:, :count] + APART
+            work = seen["steps"][:, :count] + CALL
             seen["solve_time"] = seconds * work / work.sum()
+            if count:
+                self.controllers.pace.took(seconds, int(seen["steps"][:, :count].sum()), self.count * count)
             for name, values in seen.items():
                 self._put(fields, name, first, values[:, :count])
             before, done = done, done + carried
             if done < self.samples and not decided:
-                packed = self._decide(packed, fields, done)
+                packed = self._decide(packed, fields, done, seen["solve_time"][:, -1])
             if carried:
                 tick(min(done, self.samples) - before)
         return fields
@@ -199,14 +199,13 @@ class _Run:
             fields[name] = np.empty((len(values), self.samples, *values.shape[2:]), dtype=values.dtype)
         fields[name][:, begin : begin + values.shape[1]] = values[:, : max(self.samples - begin, 0)]
 
-    def _decide(self, packed: Any, fields: dict[str, np.ndarray], at: int) -> Any:
-        """Decide sample `at` outside the stride, and record how."""
+    def _decide(self, packed: Any, fields: dict[str, np.ndarray], at: int, spent: np.ndarray) -> Any:
+        """Decide sample `at` outside the stride, where it took so many seconds, and record how."""
         now: Now = self.of_now.unpack(np.array(packed))
         which = np.flatnonzero(~now.decided)
-        x, good, said = self.controllers.finish_open(now.moment, which, np.zeros(len(which)))
+        x, good, said = self.controllers.finish_open(now.moment, which, spent[which])
         for name in said.keys() & fields.keys():
-            before = fields[name][which, at] if name == "solve_time" else 0
-            fields[name][which, at] = before + said[name]
+            fields[name][which, at] = said[name]
         decided: Any = np.ones(self.count, dtype=bool)
         return self.of_now.pack(now._replace(x=x, good=good, decided=decided))
 
@@ -227,7 +226,7 @@ def _stride(leaves, packed, inputs, settings, most, form, of_now: Packing):
     now: Now = of_now.unpack(packed)
     cvs, future = now.cv.shape[1], now.moment.free_response.shape[1]
     setpoints, errors, faults = (inputs[..., k * cvs : (k + 1) * cvs] for k in range(3))
-    disturbance, told = inputs[..., -1], settings[:, 2:] > 0
+    disturbance, told = inputs[..., -1], settings[:, 3:] > 0
     late = now.decided[0].astype(int)  # measured is sample `late`, then late + 1, ...
 
     def carry_out(now: Now, at) -> tuple[Now, dict[str, Array]]:
@@ -250,7 +249,7 @@ def _stride(leaves, packed, inputs, settings, most, form, of_now: Packing):
             mv=jnp.where(told, now.mv, jnp.nan),
             manual=jnp.zeros(now.mv.shape, dtype=bool),
         )
-        moment = considered(cores, before, sample, settings[:, :2])
+        moment = considered(cores, before, sample, settings[:, :3])
         found, state, whole = moment.decision, moment.state, cores.value.tables.count > 0
         own = dict(cv=now.cv, bias=state.bias, bias_raw=state.bias_raw, steps=found.steps)
         now = now._replace(moment=moment, x=found.x, good=moment.good, decided=moment.good | ~whole)

@@ -136,8 +136,11 @@ class CondensedQp(eqx.Module):
 
     @property
     def unit(self) -> Float[Array, ""]:
-        """Of the objective, see `relaxed.gap.closes`."""
-        return jnp.maximum(jnp.max(jnp.diagonal(self.curvature, axis1=-2, axis2=-1), axis=-1), 1e-12)
+        """Of the objective, see `relaxed.gap.closes`: its largest curvature, or that beyond the deadzones."""
+        inside = jnp.max(jnp.diagonal(self.curvature, axis1=-2, axis2=-1), axis=-1)
+        outside = jnp.max(self.bend, axis=-1)
+        some = jnp.where(inside > 0.0, inside, outside)
+        return jnp.where(some > 0.0, some, 1e-12)
 
     @property
     def theta(self) -> Float[Array, "prediction n"]:
@@ -244,14 +247,14 @@ def condense(
     counts = jnp.broadcast_to(layout.count, (size.mvs, size.blocks)).reshape(-1)
     weight = counts * spread(tuning.move_weight)  # paid at every sample of the block
     tracking = 2.0 * jnp.einsum("c,cik->ik", tuning.cv_weight, matrices.squared)
-    scale = _variable_scale(layout, size, tuning, jnp.diagonal(tracking) + 2.0 * weight)
+    soft = tuning.soft_quadratic @ jnp.diagonal(matrices.squared, axis1=1, axis2=2)
+    scale = _variable_scale(layout, size, tuning, jnp.diagonal(tracking) + 2.0 * (weight + soft))
     weight = weight * scale**2
     tracking = tracking * scale[:, None] * scale[None, :]
     whole = layout.whole.reshape(-1)
     own = jnp.where(whole, 0.0, 1.0) if envelope else jnp.ones(n)
     slopes = [(1.0 if m == 0 else 2.0) * jnp.where(whole, weight, 0.0) for m in range(envelope)]
     row_size = raw**2 @ scale**2
-    soft = tuning.soft_quadratic @ jnp.diagonal(matrices.squared, axis1=1, axis2=2)
     return CondensedQp(
         response=raw,
         summed=matrices.summed,
@@ -267,7 +270,7 @@ def condense(
         slack_weight=tuning.slack_weight,
         scale=scale,
         row_size=row_size,
-        row_unit=_row_unit(row_size),
+        row_unit=_row_unit(row_size, size.cvs),
         bend=2.0 * soft * scale**2,
         reach=jnp.max(matrices.largest * scale, axis=1),
         whole=whole,
@@ -276,18 +279,32 @@ def condense(
     )
 
 
-def _row_unit(row_size):
-    """See `CondensedQp`; rows that hardly any move reaches count as longer than they are."""
-    longest = jnp.max(row_size)
-    size = jnp.maximum(row_size, FLAT_ROW * jnp.where(longest > 0.0, longest, 1.0))
-    return 1.0 / COARSE ** jnp.ceil(jnp.log(size) / np.log(COARSE))
+def _row_unit(row_size, cvs: int):
+    """See `CondensedQp`; rows that hardly any move reaches count as longer than they are.
+
+    Every CV is measured by its own longest row, so that its unit does not matter.
+    """
+    by_cv = row_size.reshape(cvs, -1)
+    longest = jnp.max(by_cv, axis=1, keepdims=True)
+    longest = jnp.where(longest > 0.0, longest, 1.0)
+    share = jnp.maximum(by_cv / longest, FLAT_ROW)
+    return (1.0 / (longest * COARSE ** jnp.ceil(jnp.log(share) / np.log(COARSE)))).reshape(-1)
 
 
 def _variable_scale(layout: Layout, size: Size, tuning: Tuning, curvature) -> Float[Array, " n"]:
-    """MV units per unit of x: the step, else the move limit, else an eighth of the range, else by curvature."""
+    """MV units per unit of x: the step, else the move limit, else an eighth of the range, else by curvature.
+
+    By curvature an MV is measured so that one unit of x costs what it costs of the dearest of the other MVs; where none has
+    limits, what a deviation by a deadzone costs, or by the range of a CV's limits. No unit then matters.
+    """
     finite = lambda a, other: jnp.where(jnp.isfinite(a) & (a > 0), a, other)  # noqa: E731
     by_curvature = 1.0 / jnp.sqrt(jnp.where(curvature > 0, curvature, 1.0))
     by_curvature = jnp.where(layout.real, by_curvature.reshape(size.mvs, -1), 0.0).max(axis=1)
-    by_range = finite((tuning.mv_high - tuning.mv_low) / 8.0, by_curvature)
+    by_range = finite((tuning.mv_high - tuning.mv_low) / 8.0, 0.0)
     by_move = finite(jnp.maximum(jnp.abs(tuning.move_low), jnp.abs(tuning.move_high)), by_range)
-    return jnp.repeat(jnp.where(layout.integer, layout.step, by_move), size.blocks)
+    known = jnp.where(layout.integer, layout.step, by_move)
+    costs = jnp.where(layout.real, curvature.reshape(size.mvs, -1), 0.0).max(axis=1) * known**2
+    of_cv = finite(tuning.deadzone, finite(tuning.cv_high - tuning.cv_low, 0.0))
+    deviation = finite(jnp.max((tuning.cv_weight + tuning.soft_quadratic) * of_cv**2), 1.0)
+    like_others = jnp.sqrt(finite(jnp.max(costs), deviation)) * by_curvature
+    return jnp.repeat(jnp.where(known > 0.0, known, like_others), size.blocks)

@@ -30,6 +30,7 @@ from jaxmpc.problem.structure import Structure
 BLOCKS = (4, 8, 16, 32, 64, 128, 256)
 HORIZON = (32, 64, 128, 256, 384, 512)
 WINDOW = (32, 128, 512)
+VALUES = (8, 64, 512)
 
 
 def rung(count: int, ladder: tuple[int, ...]) -> int:
@@ -47,12 +48,14 @@ class Size(NamedTuple):
     # samples of the shift register, at least the prediction horizon and the coefficients of the model
     future: int
     windows: int  # rows of the predictive mean-move limit per MV; none in other modes
-    past: int  # moves that the mean-move limit remembers
+    past: int  # moves that the mean-move limit and the dwell remember
     own_blocks: bool = False  # whether the MVs may have blocks of their own
+    values: int = 0  # allowed values of an MV, none where no MV has a list
 
     @classmethod
     def of(cls, structure: Structure, samples: int) -> Size:
         """The size of a structure with a model of so many coefficients."""
+        lists = [values for values in structure.integer_values if values is not None]
         return cls(
             cvs=structure.cv_count,
             mvs=structure.mv_count,
@@ -60,8 +63,9 @@ class Size(NamedTuple):
             horizon=rung(structure.horizon_count, HORIZON),
             future=rung(max(structure.prediction_horizon, samples), HORIZON),
             windows=rung(len(window_rows(structure)), HORIZON) if len(window_rows(structure)) else 0,
-            past=rung(structure.mean_move_window, WINDOW),
+            past=rung(max(structure.mean_move_window, *structure.dwell, 1), WINDOW),
             own_blocks=structure.own_blocks,
+            values=rung(max(map(len, lists)), VALUES) if lists else 0,
         )
 
     @property
@@ -107,6 +111,8 @@ class Layout(eqx.Module):
     first: Int[Array, ""]  # Hw
     last: Int[Array, ""]  # Hp
     dt: Float[Array, ""]  # sampling interval [s]
+    # allowed values, infinite for MVs without a list and beyond its end; None where the size has none [MV unit]
+    values: Float[Array, "mv value"] | None = None
 
     @property
     def real(self) -> Bool[Array, "*mv block"]:
@@ -128,7 +134,9 @@ def layout_of(structure: Structure, size: Size) -> Layout:
     # the window that ends at sample k of the horizon holds the last window - 1 - k past moves
     age = np.arange(size.past)[::-1]  # of the past moves, oldest first
     remaining = (age[None, :] < window - 1 - np.arange(size.windows)[:, None]) & predictive
-    step = structure.integer_step
+    step = structure.steps
+    lists = structure.integer_values or (None,) * structure.mv_count
+    allowed = [np.pad(v or (), (0, size.values - len(v or ())), constant_values=np.inf) for v in lists]
     whole = np.array([structure.whole_blocks(mv) for mv in range(size.mvs)])
     if size.own_blocks:
         each = [_of_blocks(structure, size, mv) for mv in range(size.mvs)]
@@ -146,6 +154,7 @@ def layout_of(structure: Structure, size: Size) -> Layout:
         first=np.asarray(structure.first_penalised),
         last=np.asarray(structure.prediction_horizon),
         dt=np.asarray(structure.dt),
+        values=np.array(allowed) if size.values else None,
     )
     return Layout(**fields)
 

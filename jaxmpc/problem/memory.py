@@ -58,9 +58,10 @@ def check_ranges(structure: Structure, lower: np.ndarray, upper: np.ndarray) -> 
     most = np.maximum(width, far).max(axis=0)
     mvs = range(structure.mv_count)
     mv = np.repeat(mvs, [structure.whole_blocks(mv) for mv in mvs])[int(np.argmax(most))]
+    listed = structure.integer_step[mv] is None
     raise InputError(
-        f"structure.integer_step.{structure.mv_names[mv]}",
-        structure.integer_step[mv],
+        f"structure.{'integer_values' if listed else 'integer_step'}.{structure.mv_names[mv]}",
+        structure.integer_values[mv] if listed else structure.integer_step[mv],
         f"a step [MV unit] with fewer whole moves inside the limits: up to {most.max():.3g} of them per block take "
         f"{_gib(needed)} of the {_gib(BUDGET)} that one problem may take",
         "Take a larger step, or narrower tuning.move_low and tuning.move_high",

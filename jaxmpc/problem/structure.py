@@ -7,6 +7,7 @@ Programs are compiled for its size only (`layout`), and see what follows from it
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from typing import Any, Literal
 
@@ -15,6 +16,7 @@ from jaxmpc.check import LARGEST, is_count, is_number
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.declared import declare, declared
+from jaxmpc.problem.values import checked_values, has_gaps, spacing
 
 THESIS_BLOCKS = (1, 1, 1, 1, 2, 2, 4, 4, 8, 8, 8, 16, 16, 32, 32, 64)  # (6.3)
 
@@ -26,6 +28,11 @@ class Structure:
     With blocking ``moves`` the move is constant over a block (thesis figure 25), with ``inputs`` the MV is (thesis 6.2):
     it moves at block starts only. The mean-move limit is ``reactive`` (thesis: once the mean of the past moves exceeds
     the limit, no move in that direction) or ``predictive`` (rows on the windowed sum inside the control horizon).
+
+    An integer MV moves in steps of one size, or among listed values; with ``moves`` and a block of several samples every
+    value on its way must be in the list. Two of its moves are at least `dwell` samples apart; with ``moves`` the move of a
+    block of several samples repeats in each of them, so that a dwell of 2 or more leaves such a block without one.
+    Beyond the integer horizon, where moves are relaxed, neither holds.
     """
 
     cv_names: tuple[str, ...] = declare("", "names of the CVs", "in the order of every array")
@@ -54,6 +61,20 @@ class Structure:
     )
     integer_step: tuple[float | None, ...] = declare(
         "MV unit", "step of {}", "None if continuous; empty if all are", "6.2", of="mv", preset=()
+    )
+    integer_values: tuple[tuple[float, ...] | None, ...] = declare(
+        "MV unit",
+        "allowed values of {}",
+        "increasing, in place of a step; None without a list; empty if there is none",
+        of="mv",
+        preset=(),
+    )
+    dwell: tuple[int, ...] = declare(
+        "samples",
+        "minimum dwell of {}",
+        "from one move of an integer MV to the next; 1 for none; empty if there is none",
+        of="mv",
+        preset=(),
     )
     integer_horizon: tuple[int | None, ...] = declare(
         "samples",
@@ -106,7 +127,43 @@ class Structure:
         object.__setattr__(
             self, "integer_step", tuple(None if step is None else float(step) for step in steps)
         )
+        self._check_values()
+        self._check_dwell()
         object.__setattr__(self, "integer_horizon", self._checked_horizon())
+
+    def _check_values(self) -> None:
+        lists = tuple(self.integer_values) or (None,) * self.mv_count
+        if len(lists) != self.mv_count:
+            raise InputError("structure.integer_values", list(lists), f"{self.mv_count} entries, one per MV")
+        checked = []
+        for name, step, values in zip(self.mv_names, self.integer_step, lists, strict=True):
+            path = f"structure.integer_values.{name}"
+            if values is not None and step is not None:
+                raise InputError(path, list(values), f"no list for an MV with an integer_step ({step:g})")
+            checked.append(None if values is None else checked_values(path, values))
+        object.__setattr__(self, "integer_values", tuple(checked) if any(checked) else ())
+
+    def _check_dwell(self) -> None:
+        dwell = tuple(self.dwell) or (1,) * self.mv_count
+        if len(dwell) != self.mv_count:
+            raise InputError("structure.dwell", list(dwell), f"{self.mv_count} entries, one per MV")
+        for mv, (name, samples) in enumerate(zip(self.mv_names, dwell, strict=True)):
+            path = f"structure.dwell.{name}"
+            if not is_count(samples):
+                raise InputError(path, samples, "a whole number of samples, 1 or more")
+            if samples > 1 and mv not in self.integer_mvs:
+                expected = "1 for a continuous MV, which moves at every sample"
+                raise InputError(path, samples, expected, "Give it an integer_step or integer_values")
+            if samples > 1 and self.blocking == "moves" and min(self.blocks_of(mv)) > 1:
+                raise InputError(
+                    path,
+                    samples,
+                    "1 where a move repeats in every sample of a block (blocking moves) and no block has a single sample: "
+                    "the MV could never move",
+                    "Take blocking inputs, or begin with blocks of one sample",
+                )
+        dwell = tuple(map(int, dwell))
+        object.__setattr__(self, "dwell", dwell if max(dwell, default=1) > 1 else ())
 
     def _checked_blocks(self) -> tuple[int, ...] | tuple[tuple[int, ...], ...]:
         """Lengths of the blocks, one list where those of all MVs are equal."""
@@ -200,11 +257,28 @@ class Structure:
     @property
     def integer_mvs(self) -> tuple[int, ...]:
         """Positions of the integer MVs."""
-        return tuple(i for i, step in enumerate(self.integer_step) if step is not None)
+        return tuple(i for i, step in enumerate(self.steps) if step is not None)
+
+    @functools.cached_property
+    def steps(self) -> tuple[float | None, ...]:
+        """Steps of the integer MVs, of a list the greatest that its values have in common; None if continuous [MV unit]."""
+        lists = self.integer_values or (None,) * self.mv_count
+        pairs = zip(self.integer_step, lists, strict=True)
+        return tuple(step if values is None else spacing(values) for step, values in pairs)
+
+    @functools.cached_property
+    def has_gaps_or_dwell(self) -> bool:
+        """Whether limits and rows do not say all of what whole moves must keep: a list has gaps, or there is a dwell.
+
+        The search on the host knows it; a compiled program leaves the whole moves of such a structure to it.
+        """
+        return bool(self.dwell) or any(
+            values is not None and has_gaps(values) for values in self.integer_values
+        )
 
     def relaxed(self) -> Structure:
         """The same structure with every MV continuous."""
-        return dataclasses.replace(self, integer_step=())
+        return dataclasses.replace(self, integer_step=(), integer_values=(), dwell=())
 
 
 def check_match(structure: Structure, model: StepResponseModel, path: str = "model") -> None:

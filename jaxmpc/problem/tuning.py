@@ -19,6 +19,7 @@ from jaxmpc.check import LARGEST
 from jaxmpc.errors import InputError
 from jaxmpc.problem.declared import declare, declared
 from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.values import has_gaps
 
 _cv, _mv = partial(declare, of="cv"), partial(declare, of="mv")
 _cv_limit, _mv_limit = (partial(one, infinite=True, least=-np.inf) for one in (_cv, _mv))
@@ -147,13 +148,25 @@ def make_tuning(structure: Structure, *, path: str = "tuning", **fields) -> Tuni
                 expected = f"a limit below +inf (and {high}[{i}] above -inf) for {name}"
             if expected:
                 raise InputError(f"{path}.{low}[{i}]", least, expected)
-    for name, watched, step in zip(
-        structure.mv_names, values["oscillation_rows"], structure.integer_step, strict=True
-    ):
-        if watched and step is None:
+    for mv, (name, watched) in enumerate(zip(structure.mv_names, values["oscillation_rows"], strict=True)):
+        listed, expected = structure.integer_values[mv] if structure.integer_values else None, ""
+        if watched and structure.steps[mv] is None:
             expected = "false for a continuous MV (the width of the rows is the integer step)"
+        if watched and listed is not None and has_gaps(listed):
+            expected = "false for an MV with an uneven list of values (the width of the rows is one step)"
+        if expected:
             raise InputError(f"{path}.oscillation_rows.{name}", True, expected)
     return Tuning(**{key: jnp.asarray(value) for key, value in values.items()})
+
+
+def within_values(structure: Structure, tuning: Tuning) -> Tuning:
+    """The tuning with MV limits no wider than the lists of allowed values."""
+    if not structure.integer_values:
+        return tuning
+    ends = [(v[0], v[-1]) if v else (-np.inf, np.inf) for v in structure.integer_values]
+    low, high = np.array(ends).T
+    limits = jnp.maximum(tuning.mv_low, low), jnp.minimum(tuning.mv_high, high)
+    return eqx.tree_at(lambda t: (t.mv_low, t.mv_high), tuning, limits)
 
 
 def stack_tunings(tunings) -> Tuning:

@@ -1,9 +1,12 @@
-"""Time of compiled calls and of bars, without what first calls take to compile."""
+"""Time of compiled calls and of bars, without what first calls take to compile; and what keeps a short time short."""
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import threading
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -41,3 +44,16 @@ class Clock:
     def seconds(self) -> float:
         """Since the start [s]."""
         return max(time.perf_counter() - self.begin - (_here.seconds - self.compiled), 0.0)
+
+
+@contextlib.contextmanager
+def in_time(limit: float | None) -> Iterator[None]:
+    """With a time limit nothing waits for a search for garbage, which takes a fifth of a second among compiled programs."""
+    if limit is None or not gc.isenabled():
+        yield
+        return
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()

@@ -49,7 +49,7 @@ def say(text: str) -> None:
         sys.stderr.flush()
 
 
-def _is_quiet() -> bool:
+def is_quiet() -> bool:
     """Whether nobody is told: as asked for, or because whoever has spawned this process shows what it does."""
     from multiprocessing import parent_process
 
@@ -86,7 +86,7 @@ class Compilation:
             self._begun = time.monotonic()
             if self._begun - self._ended > APART:
                 self._pause, self._said = self._begun, False
-            if self._said or _is_quiet():
+            if self._said or is_quiet():
                 return
             self._timer = threading.Timer(max(LONG, self._pause + PAUSE - self._begun), self._tell)
             self._timer.daemon = True

@@ -39,6 +39,7 @@ SOFT, STIFF, SOFTEST = 1.0, 1e4, 0.1
 # the first and the last of these curvatures, and that of CV limits per price of eps: where one lets steps go in circles,
 # another may not
 ATTEMPTS = np.array([(SOFT, STIFF, 0.3), (100.0, 1e5, 100.0), (10.0, 1e3, 0.3), (1000.0, 1e6, 100.0)])
+MOST_STEPS = STEPS * len(ATTEMPTS)  # Newton steps of a lane
 STIFFEN = 10.0  # what it grows by when the problem with the present prices is solved, and falls by after a short step
 SHORT, SHORTER = (
     0.03,
@@ -267,12 +268,13 @@ def _away(sigma, value, price, low, high):
     return z - jnp.clip(z, sigma * low, sigma * high)
 
 
-def refine(problem: Prepared, start: WarmStart) -> QpSolution:
+def refine(problem: Prepared, start: WarmStart, most: Array | float = np.inf) -> QpSolution:
     """Solve one lane from a start.
 
     Args:
         problem: the lane.
         start: where to begin.
+        most: Newton steps after which moves and prices are judged as they are.
 
     Returns:
         The solution, judged by `relaxed.problem.conclude`.
@@ -347,7 +349,7 @@ def refine(problem: Prepared, start: WarmStart) -> QpSolution:
         return jax.lax.cond(anew, lambda: fresh, lambda: after)
 
     def unfinished(state: _State):
-        return ~state.done & (state.steps < STEPS * len(ATTEMPTS))
+        return ~state.done & (state.steps < jnp.minimum(most, MOST_STEPS))
 
     nothing = _begin(p, jax.tree.map(jnp.zeros_like, start))
     state = jax.lax.while_loop(unfinished, step, _begin(p, start))

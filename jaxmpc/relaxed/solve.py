@@ -6,8 +6,12 @@ after the other, so that each takes the steps it needs (`programs.lanes`).
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmpc.problem.condense import CondensedQp
@@ -40,14 +44,17 @@ def solve_relaxed(
 
 
 @one_by_one
-def solve_lane(qp: CondensedQp, instance: QpInstance, lower, upper, start: WarmStart) -> QpSolution:
-    """`solve_relaxed` from a start."""
-    return refine(prepare(qp, instance, lower, upper), start)
+def solve_lane(
+    qp: CondensedQp, instance: QpInstance, lower, upper, start: WarmStart, most: Array | float = np.inf
+) -> QpSolution:
+    """`solve_relaxed` from a start, in so many Newton steps at most; its certificate is what they reach."""
+    return refine(prepare(qp, instance, lower, upper), start, most)
 
 
 def cold_start(qp: CondensedQp, instance: QpInstance) -> WarmStart:
     """A start that knows nothing: no moves, no prices."""
-    none = jnp.zeros_like
+    # on the host NumPy makes zeros in no time
+    none: Any = jnp.zeros_like if isinstance(instance.lower, jax.Array) else np.zeros_like
     x, hard = none(instance.lower), none(instance.row_low)
     position = hard[: 0 if qp.position_weight is None else hard.shape[0]]
     return WarmStart(x, none(instance.offset), none(qp.steep), position, none(instance.limit_high), x, hard)

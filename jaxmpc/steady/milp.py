@@ -153,7 +153,7 @@ class PiecewiseMilp:
         for goal, before in zip(later[1:], later[:-1], strict=True):
             index = np.flatnonzero(self.cost[before])
             self._row(-np.inf, float(self.cost[before] @ x) + TIE, index, self.cost[before][index])
-            again, _ = self._minimise(goal)
+            again, _ = self._minimise(goal, x)
             x = x if again is None else again  # lost to rounding: keep what is proven
         sign = -1.0 if first == "profit" else 1.0
         return Best(self._mv(x), first, sign * bound * self.unit[first])
@@ -173,8 +173,11 @@ class PiecewiseMilp:
         least, most = self.ranges[int(np.argmax(x[self.at["range"]]))]
         return np.array([np.clip(choke, *self.choke), np.clip(lift, least, most)])
 
-    def _minimise(self, goal: Goal) -> tuple[np.ndarray | None, float]:
-        """Best solution of one goal and the bound, in units of the problem; None if there is none."""
+    def _minimise(self, goal: Goal, known: np.ndarray | None = None) -> tuple[np.ndarray | None, float]:
+        """Best solution of one goal and the bound, in units of the problem; None if there is none.
+
+        `known` is feasible: what it disproves is not believed.
+        """
         entries = tuple(np.concatenate(part) for part in zip(*self._entries, strict=True))
         status, x, bound = solve_milp(
             self.cost[goal],
@@ -184,6 +187,7 @@ class PiecewiseMilp:
             self.low,
             self.high,
             self.integer,
+            known=known,
         )
         if status not in ("optimal", "infeasible"):
             raise RuntimeError(f"HiGHS ended a problem of the real-time optimisation with {status}")

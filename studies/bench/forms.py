@@ -128,6 +128,11 @@ def lifted(case: dict) -> Form:
     require(
         plain, "structure", case["structure"], "one list of blocks and no integer_horizon for other solvers"
     )
+    for key in ("integer_values", "dwell"):
+        given = case["structure"].get(key)
+        require(
+            not given, f"structure.{key}", given, "none for other solvers, whose forms have no rows for it"
+        )
     units = move_units(n)
     size = cv_units(n, units)
     counts = np.ones(len(n.blocks)) if n.blocking == "inputs" else np.array(n.blocks, dtype=float)

@@ -18,11 +18,12 @@ from jaxmpc.errors import InputError, near
 from jaxmpc.problem.declared import declared
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS as TUNING
+from jaxmpc.problem.values import checked_values
 from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS, WellParameters
 from studies.definition import presets, references
 
 LONGEST = 10_000  # samples of a horizon; more would not fit into memory
-Kind = Literal["number", "whole", "flag", "text", "lengths"]
+Kind = Literal["number", "whole", "flag", "text", "lengths", "values"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +33,8 @@ class Field:
     key: str  # its path below [base]
     label: str  # what it is, for legends and tables
     unit: str  # of a number ("1" without unit, "" for what is not a number)
-    kind: Kind = "number"  # number, whole number, flag (true or false), text, or lengths (of blocks)
+    # number, whole number, flag (true or false), text, lengths (of blocks), or values (a list of allowed ones)
+    kind: Kind = "number"
     default: Any = None  # what holds where nothing is given; None where another key or the preset decides
     choices: tuple[str, ...] = ()  # the texts that are accepted, where there are few
     shape: bool = False  # whether it fixes the shape of the compiled program
@@ -58,6 +60,8 @@ class Field:
                 f"lengths of blocks in whole samples, 1 or more and {LONGEST} together at most, such as [1, 1, 2, 4], "
                 f"or a list of them for each of {own}"
             )
+        if self.kind == "values":
+            return f"two or more numbers, increasing [{self.unit}], such as [0, 10, 25, 60, 100]"
         words = "a whole number" if self.kind == "whole" else f"a {'' if self.infinite else 'finite '}number"
         if self.low > -math.inf:
             bounded = self.high < LARGEST
@@ -67,7 +71,7 @@ class Field:
     def check(self, path: str, value: Any) -> Any:
         """The value in its plain type, or an `InputError` that names `path`.
 
-        Numbers become floats, whole numbers ints, lengths tuples of ints, one for all MVs or one per MV.
+        Numbers become floats, whole numbers ints, lengths tuples of ints (one for all MVs or one per MV), values of floats.
         """
         shown, hint = value, ""
         if self.kind == "flag":
@@ -82,6 +86,8 @@ class Field:
             lists = tuple(value or ()) if own else (value,)
             good = len(lists) == (len(MV_NAMES) if own else 1) and all(map(_are_lengths, lists))
             value = tuple(map(tuple, lists)) if good and own else value
+        elif self.kind == "values":
+            return checked_values(path, value)
         elif isinstance(value, bool) or not isinstance(value, (int, float)):
             good = False
         elif isinstance(value, int) and value.bit_length() > 63:  # no float has room for some of them
@@ -96,7 +102,7 @@ class Field:
         return {"whole": int, "number": float, "lengths": tuple}.get(self.kind, lambda same: same)(value)
 
     def parse(self, path: str, text: str) -> Any:
-        """The value that a cell of a CSV file holds; lengths are separated by spaces, lists of the MVs by semicolons."""
+        """The value of a cell of a CSV file; lengths and values are separated by spaces, lists of the MVs by semicolons."""
         text = text.strip()
         value: Any = text
         try:
@@ -105,6 +111,8 @@ class Field:
             elif self.kind == "lengths":
                 lists = [[int(part) for part in own.split()] for own in text.split(";")]
                 value = lists if len(lists) > 1 else lists[0]
+            elif self.kind == "values":
+                value = [float(part) for part in text.split()]
             elif self.kind == "whole":
                 value = int(text)
             elif self.kind == "number":
@@ -123,7 +131,7 @@ class Field:
 
 
 def as_text(value: Any) -> str:
-    """A flag, text or list of lengths as it stands in a coordinate and in a CSV file."""
+    """A flag, text or list of lengths or values as it stands in a coordinate and in a CSV file."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
@@ -203,6 +211,13 @@ def _table() -> dict[str, Field]:
         shaping("mean_move_window"),
         shaping("mean_move_mode"),
     ]
+    for name, unit in zip(MV_NAMES, MV_UNITS, strict=True):
+        for key, given in (("integer_values", {"unit": unit}), ("dwell", {})):
+            kind = (
+                dict(kind="values", low=-math.inf, high=math.inf, default=None) if given else dict(default=1)
+            )
+            label = structure[key].meaning.format(_SPOKEN[name])
+            out.append(dataclasses.replace(shaping(key, **given, **kind), key=f"{key}.{name}", label=label))
     for of, names, units in (("cv", CV_NAMES, CV_UNITS), ("mv", MV_NAMES, MV_UNITS), ("", ("",), ("",))):
         for key, field in TUNING.items():
             common: dict[str, Any] = dict(infinite=field.infinite, low=field.least)

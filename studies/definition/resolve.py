@@ -172,10 +172,17 @@ def _structure(settings: Settings, k: int) -> Structure:
     blocks, blocking = value("blocks"), value("blocking")
     horizon = value("control_horizon") or sum(blocks[0] if isinstance(blocks[0], tuple) else blocks)
     base = presets.structure("moves", integer=value("controller") == "mixed-integer")
+    own: dict[str, Any] = {}
+    if base.integer_mvs:
+        lists = [value(f"integer_values.{name}") for name in MV_NAMES]
+        steps = [step if values is None else None for step, values in zip(base.steps, lists, strict=True)]
+        dwell = [value(f"dwell.{name}") for name in MV_NAMES]
+        own = dict(integer_step=tuple(steps), integer_values=tuple(lists), dwell=tuple(dwell))
     same = ("prediction_horizon", "first_penalised", "integer_horizon", "mean_move_window", "mean_move_mode")
 
     def place(field: str) -> str:
-        key = field.removeprefix("structure.").partition(".")[0]
+        name = field.removeprefix("structure.")
+        key = name if name in FIELDS else name.partition(".")[0]
         partner = {"blocks": ["control_horizon"], "first_penalised": ["prediction_horizon"]}.get(key, [])
         return settings.table.blame([key, *filter(settings.given, partner)], k)
 
@@ -186,6 +193,7 @@ def _structure(settings: Settings, k: int) -> Structure:
             blocks=() if blocking == "none" else blocks,
             blocking="moves" if blocking == "none" else blocking,
             **{key: value(key) for key in same},
+            **own,
         )
 
 

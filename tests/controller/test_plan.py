@@ -118,6 +118,13 @@ def test_every_way_to_finish_is_exact_alone(name, blocking, finish):
     assert plan.finished_by in (finish, "relaxation", "fixing")
 
 
+@pytest.mark.parametrize(("seed", "shape"), [(42, [2, 4]), (1089, [6])])
+def test_relaxed_moves_that_end_on_several_whole_steps_are_not_the_optimum_by_themselves(seed, shape):
+    """P |d| is less than P d^2 there: the first relaxation, made for single steps, proves no such plan."""
+    body = twisted(seed, dict(blocks=shape), "wide_integer_moves")
+    assert oracles.complaints(body, solve(body), oracles.brute_force(body)) == [], json.dumps(body)
+
+
 def test_every_way_to_finish_is_needed_and_taken():
     """Among a few cases some are not settled by the relaxation, and then the forced path settles them."""
     for finish in FINISHES[1:]:

@@ -1,12 +1,22 @@
-"""HiGHS as it is called here: its optima and bounds against enumeration. Every version before 1.16 fails some of this."""
+"""HiGHS as it is called here: its optima and bounds against enumeration. Every version before 1.16 fails some of this.
 
+And that what is known is held against it: a solver that lies forges no proof.
+"""
+
+import importlib.metadata
 import itertools
+from types import SimpleNamespace
 
+import highspy
 import numpy as np
 import pytest
 
+from jaxmpc.controller.case import make_case
+from jaxmpc.controller.plan import Planner
 from jaxmpc.integer.feasible import Chain
 from jaxmpc.integer.highs import ReducedMilp, solve_milp
+from tests import problems
+from tests.oracles import steps as oracles
 
 
 def test_a_linear_programme_with_one_whole_variable_is_solved_to_its_optimum():
@@ -79,3 +89,123 @@ def test_bounds_of_the_reduced_problem_hold_and_its_points_are_optimal_one_after
         assert values[at] <= best + 1e-6 * (1 + abs(best))
         milp.forbid(point)
         values[at] = np.inf
+
+
+# ------------------------------------------------------------------------------------ a solver that lies
+
+
+def posed_step(seed):
+    """A step with two stepped MVs, small enough for brute force, and its least objective."""
+    body = problems.small_case(np.random.default_rng(seed), blocks=[1, 2, 3], integer={0: 2.0, 1: 0.5})
+    return body, oracles.brute_force(body).objective
+
+
+def finished_by_highs(body):
+    """The plan where HiGHS alone has to close what fixing leaves."""
+    case = make_case(body)
+    planner = Planner(case.structure, case.tuning, case.model)
+    step = {k: getattr(case, k) for k in ("mv_now", "last_move", "free_response", "setpoint", "gap")}
+    return planner.solve(**step, finish="highs")
+
+
+def too_high(milp, seconds, honest):
+    bound, point, finished = honest(milp, seconds)
+    return (bound if np.isfinite(bound) else 1.0) * 3.0 + 10.0 * milp.unit, point, finished
+
+
+def nothing_feasible(milp, seconds, honest):
+    return np.inf, None, True
+
+
+def breaks_rows(milp, seconds, honest):
+    bound, _, _ = honest(milp, seconds)
+    return bound, milp.upper + 1, True
+
+
+@pytest.mark.parametrize("lie", [too_high, nothing_feasible, breaks_rows])
+def test_a_solver_that_lies_is_told_of_and_does_not_change_the_answer(lie, monkeypatch, capsys):
+    honest, told = ReducedMilp.solve, 0
+    for seed in range(6):
+        body, best = posed_step(seed)
+        calls = []
+
+        def lying(own, seconds, calls=calls):
+            calls.append(seconds)
+            return lie(own, seconds, honest)
+
+        monkeypatch.setattr(ReducedMilp, "solve", lying)
+        plan = finished_by_highs(body)
+        said = capsys.readouterr().err
+        assert plan.status in ("optimal", "unproven")
+        assert plan.bound <= best * (1.0 + 1e-6)
+        if plan.status == "optimal":
+            assert plan.objective == pytest.approx(best, rel=1e-6)
+        if calls:
+            assert plan.finished_by == "branch-and-bound"
+            assert f"highspy {importlib.metadata.version('highspy')}" in said
+            told += 1
+    assert told >= 3
+
+
+def test_an_honest_solver_is_believed(capsys):
+    for seed in range(6):
+        body, best = posed_step(seed)
+        plan = finished_by_highs(body)
+        assert plan.status == "optimal"
+        assert plan.objective == pytest.approx(best, rel=1e-6)
+        assert "highspy" not in capsys.readouterr().err
+
+
+class Lying:
+    """HiGHS with another status, bound or point."""
+
+    def __init__(self, state=None, bound=None, point=None):
+        self.own, self.state, self.bound, self.point = highspy.Highs(), state, bound, point
+
+    def __getattr__(self, name):
+        return getattr(self.own, name)
+
+    def getModelStatus(self):
+        return self.own.getModelStatus() if self.state is None else self.state
+
+    def getInfo(self):
+        info = self.own.getInfo()
+        bound = info.mip_dual_bound if self.bound is None else self.bound
+        return SimpleNamespace(mip_dual_bound=bound, primal_solution_status=info.primal_solution_status)
+
+    def getSolution(self):
+        return self.own.getSolution() if self.point is None else SimpleNamespace(col_value=self.point)
+
+
+@pytest.mark.parametrize(
+    ("lie", "known"),
+    [
+        (dict(bound=9.5), None),  # above its own point
+        (
+            dict(bound=12.5, point=[2.0, 3.0]),
+            [4.5, 0.0],
+        ),  # a point that is not the best, with its value as the bound
+        (dict(point=[2.0, 2.0]), None),  # breaks the row
+        (dict(point=[4.0, 0.5]), None),  # not whole
+        (dict(state=highspy.HighsModelStatus.kInfeasible), [4.5, 0.0]),
+    ],
+)
+def test_an_answer_that_contradicts_itself_or_what_is_known_is_a_failure(lie, known, monkeypatch, capsys):
+    def silent():
+        highs = Lying(**lie)
+        highs.setOptionValue("output_flag", False)
+        return highs
+
+    monkeypatch.setattr("jaxmpc.integer.highs._silent_highs", silent)
+    status, point, bound = solve_milp(
+        np.array([2.0, 3.0]),
+        (np.array([0, 0]), np.array([0, 1]), np.ones(2)),
+        np.array([4.5]),
+        np.array([np.inf]),
+        np.zeros(2),
+        np.full(2, 10.0),
+        np.array([False, True]),
+        known=None if known is None else np.array(known),
+    )
+    assert (status, point, bound) == ("failed", None, -np.inf)
+    assert "highspy" in capsys.readouterr().err

@@ -288,8 +288,10 @@ def integer_range(case: dict, ceiling: float) -> float:
     return math.floor(math.sqrt(ceiling / min(weights))) + 1 if weights and min(weights) > 0 else math.inf
 
 
-def brute_force(case: dict, solver: str = "piqp", most: int = 20_000) -> Answer:
+def brute_force(case: dict, solver: str = "piqp", most: int = 20_000, keep=lambda m, plan: True) -> Answer:
     """Every integer plan within the hard constraints, each with a QP for the continuous moves.
+
+    `keep` tells of the plan of one MV whether it is one of them; a plan without moves must be.
 
     Raises:
         OverflowError: for more than `most` integer plans.
@@ -301,7 +303,7 @@ def brute_force(case: dict, solver: str = "piqp", most: int = 20_000) -> Answer:
     none = np.zeros((max(map(len, n.lists)), n.mvs))
     ceiling = objective(case, none)
     largest = math.inf if violation(case, none) > 0 else integer_range(case, ceiling)
-    per_mv = [integer_plans(case, m, largest, most) for m in integer]
+    per_mv = [[p for p in integer_plans(case, m, largest, 20 * most) if keep(m, p)] for m in integer]
     if math.prod(len(plans) for plans in per_mv) > most:
         raise OverflowError(f"more than {most} integer plans")
     form = full_form(case)

@@ -225,6 +225,14 @@ def test_structures_that_other_solvers_are_not_given_are_refused(own):
         lifted(case)
 
 
+@pytest.mark.parametrize("own", [{"integer_values": {"pump 1": [0, 1, 4]}}, {"dwell": {"pump 1": 3}}])
+def test_lists_and_dwells_that_other_solvers_do_not_know_are_refused(own):
+    case = case_to_dict(CASES[ONE])
+    case["structure"] |= own
+    with pytest.raises(InputError, match="for other solvers"):
+        lifted(case)
+
+
 def test_a_certified_optimum_is_what_plans_are_judged_by():
     case, known = case_to_dict(CASES[ONE]), KNOWN[ONE]
     judge = Judge([case, case], [known.objective * 1.01, None])

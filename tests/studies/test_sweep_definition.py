@@ -292,6 +292,26 @@ def test_settings_and_axes_reach_the_typed_objects_in_their_units():
     assert scenario.disturbance.tolist() == [0, 0, 0] + [-2] * 7
 
 
+def test_lists_and_dwell_reach_the_structure_of_mixed_integer_controllers_and_may_vary():
+    base = {"dwell": {"choke": 3}, "tuning": {"oscillation_rows": False}}
+    axes = [
+        axis("controller", "mixed-integer", "continuous"),
+        axis("integer_values.choke", [0, 10, 24, 100], [0, 50, 100]),
+    ]
+    uneven, even, *continuous = (expand(base, axes).scenario(k) for k in range(4))
+    assert uneven.structure.integer_values == ((0.0, 10.0, 24.0, 100.0), None)
+    assert uneven.structure.integer_step == (None, None)
+    assert uneven.structure.dwell == even.structure.dwell == (3, 1)
+    assert even.structure.steps == (50.0, None)
+    assert all(c.structure == c.structure.relaxed() for c in continuous)
+    plain = expand({"dwell": {"choke": 1}}).scenario(0).structure
+    assert plain == expand().scenario(0).structure
+    error = refused({}, [axis("integer_values.choke", [0, 10, 5])])
+    assert "axes[0].values[0]" in error.field
+    assert "more than 10" in str(error)
+    assert refused({"dwell": {"gas_lift": 2}}).field == "base.dwell.gas_lift"
+
+
 def test_the_offset_of_the_one_pressure_step_can_be_an_axis():
     base = {"duration": 50, "disturbance": [{"time": 20, "offset": 1}]}
     made = expand(base, [axis("disturbance.offset", 0, 3)])

@@ -16,6 +16,7 @@ from studies.bench.judge import time_each
 from studies.bench.rows import Goal, Row
 
 GAP = 1e-6  # relative, as the controllers ask for
+LIMITS = (0.003, 0.006, 0.02)  # s; of steps whose lateness is measured
 PATIENCE = 30.0  # s; most that one of our solves may take
 FLOORS = {
     ("auto", "moves"): (2.0, 40.0),
@@ -42,6 +43,8 @@ def exact(context: Context) -> Iterator[Row]:
             note = "wall time of Planner.solve, started as in the loop, all programs compiled"
             yield contest.row(finish, label, goals=goals, note=note)
         yield from contest.peer_rows()
+        context.say(f"{name}: lateness")
+        yield _lateness(f"{name}: jaxmpc, late under a limit", mode, instances)
 
 
 def _enter_ours(contest: Contest, mode: Mode, instances: Instances) -> None:
@@ -60,6 +63,33 @@ def _enter_ours(contest: Contest, mode: Mode, instances: Instances) -> None:
             solve(problem)
         seconds, plans = time_each(solve, problems)
         contest.enter(finish, seconds, [plan.moves if plan.status == "optimal" else None for plan in plans])
+
+
+def _lateness(name: str, mode: Mode, instances: Instances) -> Row:
+    """How long after its time limit a step ends, over limits that stop some steps and limits that stop most."""
+    controller = make_controller("mixed-integer", mode, instances.model)
+    planner = Planner(controller.structure, controller.tuning, controller.model)
+    problems = [instances.now.at(i) for i in range(len(instances))]
+    late = []
+    for limit in (LIMITS[-1], *LIMITS):  # the first time compiles
+        late.append(
+            [
+                max(
+                    planner.solve(**problem, recover=True, gap=GAP, time_limit=limit).solve_time_s - limit,
+                    0.0,
+                )
+                for problem in problems
+            ]
+        )
+    times = 1e3 * np.array(late[1:]).reshape(-1)
+    return Row(
+        name=name,
+        instances=len(times),
+        median_ms=float(np.median(times)),
+        p99_ms=float(np.percentile(times, 99)),
+        goals=(Goal("p99_ms", 10.0, 2.0),),
+        note=f"limits of {', '.join(f'{1e3 * limit:g}' for limit in LIMITS)} ms, cold starts; 0 for what ends in time",
+    )
 
 
 def _as_in_the_loop(planner: Planner, instances: Instances, i: int) -> dict[str, Any]:

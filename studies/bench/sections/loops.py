@@ -63,7 +63,7 @@ def broken_limits(run: Recording, kind: Kind, mode: Mode, context: Context) -> n
             over = sign * (values - limit) / np.maximum(1.0, np.abs(limit))
             worst = np.maximum(worst, over.max(axis=1))
     for mv in controller.structure.integer_mvs:
-        steps = run.move[:, mv] / controller.structure.integer_step[mv]
+        steps = run.move[:, mv] / controller.structure.steps[mv]
         worst = np.maximum(worst, np.abs(steps - np.round(steps)))
     return np.where(worst > 1e-9, worst, 0.0)  # sums of thousands of moves round
 
