@@ -17,10 +17,12 @@ from importlib import import_module as _import_module
 
 import jax as _jax
 
+from jaxmpc.programs.cache import compile_quickly as _compile_quickly
 from jaxmpc.programs.cache import keep_programs as _keep_programs
 from jaxmpc.programs.compilation import watch as _watch
 
 _jax.config.update("jax_enable_x64", True)
+_compile_quickly()
 if not _os.environ.get("JAXMPC_NO_JIT_CACHE"):
     _keep_programs()
 _watch()

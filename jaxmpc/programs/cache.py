@@ -14,6 +14,7 @@ from pathlib import Path
 from jaxmpc.programs.compilation import say
 
 SEAL = 64  # hexadecimal digits of a SHA-256
+EMITTERS = ((0, 7), (0, 10))  # first and last version of jaxlib in which XLA lets choose its CPU emitters
 
 
 def cache_folder(kind: str) -> Path:
@@ -104,6 +105,18 @@ def read_sealed(path: Path) -> bytes | None:
     with contextlib.suppress(OSError):
         path.unlink()
     return None
+
+
+def compile_quickly() -> None:
+    """Let XLA compile for a CPU without its newer emitters, which take twice as long for code that is no faster.
+
+    Only for versions that are known to have the choice: an unknown one ends the process. Too late once XLA is in use.
+    """
+    import jaxlib.version
+
+    flags, choice = os.environ.get("XLA_FLAGS", ""), "--xla_cpu_use_fusion_emitters"
+    if choice not in flags and EMITTERS[0] <= jaxlib.version.__version_info__[:2] <= EMITTERS[1]:
+        os.environ["XLA_FLAGS"] = f"{flags} {choice}=false".strip()
 
 
 def keep_programs() -> None:

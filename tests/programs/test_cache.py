@@ -232,3 +232,29 @@ def test_without_a_home_directory_the_cache_is_a_private_folder_and_one_line_say
     assert run.stderr.count("\n") == 1
     assert str(jit.parent) in run.stderr
     assert "JAXMPC_CACHE" in run.stderr
+
+
+@pytest.mark.parametrize(
+    ("version", "given", "flags"),
+    [
+        ((0, 7, 0), "", "--xla_cpu_use_fusion_emitters=false"),
+        ((0, 10, 9), "--xla_dump_to=d", "--xla_dump_to=d --xla_cpu_use_fusion_emitters=false"),
+        ((0, 10, 0), "--xla_cpu_use_fusion_emitters=true", "--xla_cpu_use_fusion_emitters=true"),
+        ((0, 11, 0), "", ""),  # it may not know the choice, and would end the process
+        ((1, 0, 0), "", ""),
+    ],
+)
+def test_quick_emitters_are_chosen_where_xla_has_them_and_nobody_else_chose(
+    version, given, flags, monkeypatch
+):
+    monkeypatch.setattr("jaxlib.version.__version_info__", version)
+    monkeypatch.setenv("XLA_FLAGS", given)
+    cache.compile_quickly()
+    assert os.environ["XLA_FLAGS"] == flags
+
+
+def test_a_process_that_imports_the_package_compiles_with_the_quick_emitters():
+    script = "import os, jaxmpc, jax.numpy as jnp; print(os.environ['XLA_FLAGS'], float(jnp.ones(3).sum()))"
+    env = {key: value for key, value in os.environ.items() if key != "XLA_FLAGS"}
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=env, check=True)
+    assert run.stdout.split() == ["--xla_cpu_use_fusion_emitters=false", "3.0"]
