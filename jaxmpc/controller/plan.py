@@ -23,9 +23,9 @@ from jaxmpc.controller.controller import Controllers, check_finish, known_of, on
 from jaxmpc.controller.core import Core
 from jaxmpc.controller.sample import require_double_precision
 from jaxmpc.integer.actuators import LONG_AGO, Actuator, actuators_of, samples_since
-from jaxmpc.integer.feasible import held_within
 from jaxmpc.integer.finish import finish_steps
 from jaxmpc.integer.host_search import SearchResult, no_whole_moves
+from jaxmpc.integer.nearest import held_within
 from jaxmpc.integer.relaxer import Relaxations
 from jaxmpc.integer.search import Decision, Relaxed, decide
 from jaxmpc.integer.solve import continuous_feasible

@@ -16,18 +16,9 @@ import itertools
 
 import numpy as np
 
+from jaxmpc.integer.chain import Chain, whole
 from jaxmpc.integer.cuts import Cuts
-from jaxmpc.integer.feasible import (
-    Chain,
-    MoveLimits,
-    around,
-    needed,
-    position_limits,
-    satisfied,
-    tighten,
-    whole,
-    within,
-)
+from jaxmpc.integer.feasible import MoveLimits, around, needed, position_limits, satisfied, tighten, within
 from jaxmpc.integer.host_search import Search, Steps
 from jaxmpc.integer.lower_bound import LowerModel, enumerate_below, exclude, radii
 from jaxmpc.integer.relaxer import LANES, Relaxations

@@ -16,17 +16,10 @@ from jaxtyping import Float
 
 from jaxmpc.errors import InputError
 from jaxmpc.integer.actuators import Actuator
-from jaxmpc.integer.feasible import (
-    UNBOUNDED,
-    UndecidedError,
-    chains_of,
-    fastest_return,
-    nearest,
-    resting,
-    satisfied,
-    whole,
-)
+from jaxmpc.integer.chain import UNBOUNDED, chains_of, resting, whole
+from jaxmpc.integer.feasible import satisfied
 from jaxmpc.integer.host_search import NOT_CLOSED, Known, SearchResult
+from jaxmpc.integer.nearest import UndecidedError, fastest_return, nearest
 from jaxmpc.integer.relaxer import Relaxations, Relaxer
 from jaxmpc.integer.solve import solve_integers
 from jaxmpc.integer.tables import Constants

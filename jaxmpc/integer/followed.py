@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxmpc.integer.feasible import SLACK
+from jaxmpc.integer.chain import SLACK
 from jaxmpc.problem.condense import Rows
 from jaxmpc.problem.instance import QpInstance
 from jaxmpc.problem.layout import Size

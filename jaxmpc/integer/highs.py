@@ -17,7 +17,7 @@ import threading
 import highspy
 import numpy as np
 
-from jaxmpc.integer.feasible import Chain
+from jaxmpc.integer.chain import Chain
 from jaxmpc.programs.compilation import say
 
 ROUNDING = 1e-6  # by which answers of HiGHS may be off

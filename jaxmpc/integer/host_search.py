@@ -15,18 +15,11 @@ import jax
 import numpy as np
 
 from jaxmpc.integer.actuators import Actuator
-from jaxmpc.integer.feasible import (
-    UNBOUNDED,
-    Chain,
-    UndecidedError,
-    chains_of,
-    held_within,
-    nearest,
-    satisfied,
-    whole,
-)
+from jaxmpc.integer.chain import UNBOUNDED, Chain, chains_of, whole
+from jaxmpc.integer.feasible import satisfied
 from jaxmpc.integer.followed import followed
 from jaxmpc.integer.lower_bound import LowerModel
+from jaxmpc.integer.nearest import UndecidedError, held_within, nearest
 from jaxmpc.integer.relaxer import LaneLimits, Relaxations
 from jaxmpc.integer.tables import Constants
 from jaxmpc.problem.instance import QpInstance

@@ -19,7 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxmpc.integer.feasible import Chain, MoveLimits, satisfied
+from jaxmpc.integer.chain import Chain
+from jaxmpc.integer.feasible import MoveLimits, satisfied
 
 GRID = 1024  # combinations up to which all are evaluated at once
 CELLS = 2**24  # partial assignments times values of the next move that are looked at together

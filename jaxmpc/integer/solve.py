@@ -18,17 +18,10 @@ import numpy as np
 
 from jaxmpc.integer.actuators import Actuator
 from jaxmpc.integer.branch_and_bound import branch_and_bound
+from jaxmpc.integer.chain import SLACK, whole
 from jaxmpc.integer.cuts import Cuts
 from jaxmpc.integer.enumeration import enumerate_all
-from jaxmpc.integer.feasible import (
-    SLACK,
-    MoveLimits,
-    UndecidedError,
-    position_limits,
-    propagate,
-    satisfied,
-    whole,
-)
+from jaxmpc.integer.feasible import MoveLimits, position_limits, propagate, satisfied
 from jaxmpc.integer.host_search import (
     GROUP,
     NOT_CLOSED,
@@ -40,6 +33,7 @@ from jaxmpc.integer.host_search import (
     no_whole_moves,
 )
 from jaxmpc.integer.lower_bound import LowerModel, enumerate_below, exclude
+from jaxmpc.integer.nearest import UndecidedError
 from jaxmpc.integer.outer_approximation import ContradictionError, outer_approximation
 from jaxmpc.integer.relaxer import Relaxations, Relaxer
 from jaxmpc.integer.scheduling import run

@@ -19,8 +19,9 @@ from jaxmpc.cli.main import main
 from jaxmpc.controller.case import make_case
 from jaxmpc.errors import InputError
 from jaxmpc.integer import lower_bound as levelset
-from jaxmpc.integer.feasible import Chain, UndecidedError, nearest
+from jaxmpc.integer.chain import Chain
 from jaxmpc.integer.lower_bound import LowerModel, enumerate_below
+from jaxmpc.integer.nearest import UndecidedError, nearest
 from jaxmpc.integer.outer_approximation import outer_approximation
 from jaxmpc.integer.solve import FINISHES
 from jaxmpc.problem.memory import BUDGET, check_ranges, check_size

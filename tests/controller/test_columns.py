@@ -14,7 +14,7 @@ from jaxmpc.controller.case import case_to_dict, make_case, plan_to_dict
 from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.controller.plan import Planner
 from jaxmpc.errors import InputError
-from jaxmpc.integer.feasible import chains_of
+from jaxmpc.integer.chain import chains_of
 from jaxmpc.integer.followed import followed
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import simulate

@@ -9,21 +9,10 @@ import numpy as np
 import pytest
 
 from jaxmpc.integer.actuators import LONG_AGO, Actuator, actuators_of, samples_since
-from jaxmpc.integer.feasible import (
-    Chain,
-    MoveLimits,
-    around,
-    chains_of,
-    fastest_return,
-    nearest,
-    position_limits,
-    propagate,
-    resting,
-    satisfied,
-    tighten,
-    within,
-)
+from jaxmpc.integer.chain import Chain, chains_of, resting
+from jaxmpc.integer.feasible import MoveLimits, around, position_limits, propagate, satisfied, tighten, within
 from jaxmpc.integer.lower_bound import LowerModel, enumerate_below
+from jaxmpc.integer.nearest import fastest_return, nearest
 from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure
 from tests.oracles.actuators import kept

@@ -13,7 +13,7 @@ import pytest
 
 from jaxmpc.controller.case import make_case
 from jaxmpc.controller.plan import Planner
-from jaxmpc.integer.feasible import Chain
+from jaxmpc.integer.chain import Chain
 from jaxmpc.integer.highs import ReducedMilp, solve_milp
 from tests import problems
 from tests.oracles import steps as oracles

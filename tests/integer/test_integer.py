@@ -9,10 +9,12 @@ import pytest
 from jaxmpc import status
 from jaxmpc.integer import listing as compiled_lists
 from jaxmpc.integer import search as compiled_search
+from jaxmpc.integer.chain import Chain
 from jaxmpc.integer.cuts import Cuts
-from jaxmpc.integer.feasible import Chain, MoveLimits, nearest, needed, propagate, satisfied, tighten, within
+from jaxmpc.integer.feasible import MoveLimits, needed, propagate, satisfied, tighten, within
 from jaxmpc.integer.host_search import Search
 from jaxmpc.integer.lower_bound import enumerate_below, exclude
+from jaxmpc.integer.nearest import nearest
 from jaxmpc.integer.relaxer import Relaxer
 from jaxmpc.integer.scheduling import run
 from jaxmpc.integer.solve import FINISHES, solve_integers
