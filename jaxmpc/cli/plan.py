@@ -42,10 +42,11 @@ def plan(options: Options) -> int:
         print(text, end="", flush=True)
     else:
         write_atomically(options.out, text)
-        said = f"jaxmpc: {status}, objective {objective}, gap {body['gap']}: {options.out}"
+    reason = f" ({body['reason']})" if "reason" in body else ""
+    if reason or options.out is not None:
+        where = "" if options.out is None else f": {options.out}"
+        said = f"jaxmpc: {status}{reason}, objective {objective}, gap {body['gap']}{where}"
         print(said, file=sys.stderr)
-    if "reason" in body:
-        print(f"jaxmpc: {status}: {body['reason']}", file=sys.stderr)
     limit = cli.EXIT_OTHER if objective is None else cli.EXIT_LIMIT  # None: it came before any feasible plan
     known = {"optimal": cli.EXIT_OPTIMAL, "infeasible": cli.EXIT_INFEASIBLE, "limit": limit}
     return known.get(status, cli.EXIT_OTHER)

@@ -77,7 +77,7 @@ def is_done_with_one_program(process, folder):
 def is_amid_the_next_program(process, folder):
     is_done_with_one_program(process, folder)
     begin = cpu_seconds(process)
-    wait_for(lambda: cpu_seconds(process) > begin + 0.5, process)
+    wait_for(lambda: cpu_seconds(process) > begin + 0.1, process)
 
 
 def has_said_that_it_compiles(process, folder):
