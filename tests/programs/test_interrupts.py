@@ -74,10 +74,10 @@ def is_done_with_one_program(process, folder):
     wait_for(lambda: list((folder / "cache" / "jit").glob("*-cache")), process)
 
 
-def is_amid_the_next_program(process, folder):
-    is_done_with_one_program(process, folder)
+def is_amid_a_program(process, folder):
+    begins_to_compile(process, folder)
     begin = cpu_seconds(process)
-    wait_for(lambda: cpu_seconds(process) > begin + 0.1, process)
+    wait_for(lambda: cpu_seconds(process) > begin + 0.5, process)
 
 
 def has_said_that_it_compiles(process, folder):
@@ -91,7 +91,7 @@ def has_said_that_it_compiles(process, folder):
         (imports_jax, ""),
         (begins_to_compile, f"(?:{NOTICE})?"),
         (is_done_with_one_program, f"(?:{NOTICE})?"),
-        (is_amid_the_next_program, f"(?:{NOTICE})?"),
+        (is_amid_a_program, f"(?:{NOTICE})?"),
         (has_said_that_it_compiles, ""),  # and does not say it again
     ],
 )
