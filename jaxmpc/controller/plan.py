@@ -109,6 +109,7 @@ def _one_posed(
     return instance, decide(core.qp, tables, instance, start, settings[0], settings[3])
 
 
+@functools.partial(jax.jit, inline=True)  # its shapes and the program that calls it are one trace
 def _posed(cores: Lanes[Core], *given) -> tuple[QpInstance, Decision]:
     """A step that is posed and decided as far as a compiled program decides it; all arrays with a lane axis."""
     return jax.vmap(functools.partial(_one_posed, cores.shared))(*given)

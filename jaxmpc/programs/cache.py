@@ -14,6 +14,7 @@ from pathlib import Path
 from jaxmpc.programs.compilation import say
 
 SEAL = 64  # hexadecimal digits of a SHA-256
+LEAST = 0.02  # s that a program takes to compile from which it is kept: reading one takes some milliseconds
 EMITTERS = ((0, 7), (0, 10))  # first and last version of jaxlib in which XLA lets choose its CPU emitters
 
 
@@ -133,7 +134,7 @@ def keep_programs() -> None:
         except OSError as error:
             say(f"compiled programs are not kept: {error}")
             return
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", LEAST)
     # JAX has no public hook; without this function only the mending is missing.
     with contextlib.suppress(ImportError, AttributeError):
         from jax._src import compilation_cache

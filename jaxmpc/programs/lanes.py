@@ -76,7 +76,8 @@ def one_by_one(function: F) -> F:
 
     Loops of lanes that differ in length then end when each is done. Accelerators take all lanes in lockstep.
     """
-    lane: Any = jax.custom_batching.custom_vmap(function)
+    traced: Any = jax.jit(function, inline=True)  # once for a lane by itself and for those of a batch
+    lane: Any = jax.custom_batching.custom_vmap(traced)
 
     @lane.def_vmap
     def _(size: int, batched, *arguments):
@@ -94,7 +95,7 @@ def one_by_one(function: F) -> F:
             result: Any = jax.lax.map(call, own)
         else:
             axes = jax.tree.map(lambda its: 0 if its else None, tuple(batched))
-            result = jax.vmap(function, in_axes=axes, axis_size=size)(*arguments)
+            result = jax.vmap(traced, in_axes=axes, axis_size=size)(*arguments)
         return result, jax.tree.map(lambda _: True, result)
 
     return lane
