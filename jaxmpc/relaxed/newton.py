@@ -123,7 +123,6 @@ class _State(NamedTuple):
     prices: _Families
     stiffness: Array
     ridge: Array
-    attempt: Array
     steps: Array
     done: Array
     left: Array
@@ -286,7 +285,7 @@ def refine(problem: Prepared, start: WarmStart, most: Array | float = np.inf) ->
         return jax.tree.map(lambda v, d: v + alpha * d, point, direction)
 
     def step(state: _State) -> _State:
-        _, stiffest, steeper = jnp.asarray(ATTEMPTS)[state.attempt]
+        _, stiffest, steeper = jnp.asarray(ATTEMPTS)[state.steps // STEPS]
         proximal = _Proximal.of(p, state.stiffness, steeper)
         point = state.point
         prices = proximal.prices(point, state.prices)
@@ -330,7 +329,6 @@ def refine(problem: Prepared, start: WarmStart, most: Array | float = np.inf) ->
             prices=jax.tree.map(lambda new, old: jnp.where(settled, new, old), prices, state.prices),
             stiffness=jnp.where(settled, stiffer, jnp.where(short, softer, state.stiffness)),
             ridge=jnp.where(short, damped, jnp.maximum(state.ridge / DAMP, RIDGE)),
-            attempt=state.attempt,
             steps=state.steps + 1,
             # rounding may keep more of the gradient than asked for: then one step leaves as much as the one before
             done=(exact | (left < ROUNDED * (1.0 + largest)) & (left > STALLED * state.left))
@@ -343,9 +341,8 @@ def refine(problem: Prepared, start: WarmStart, most: Array | float = np.inf) ->
         # a matrix that rounding left indefinite is tried again with more on its diagonal
         again = state._replace(ridge=1e2 * state.ridge, steps=state.steps + 1)
         after = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, again)
-        anew = (after.steps >= STEPS * (after.attempt + 1)) & unfinished(after)
-        softness = jnp.asarray(ATTEMPTS)[after.attempt + 1, 0]
-        fresh = nothing._replace(attempt=after.attempt + 1, steps=after.steps, stiffness=softness)
+        anew = (after.steps % STEPS == 0) & unfinished(after)
+        fresh = nothing._replace(steps=after.steps, stiffness=jnp.asarray(ATTEMPTS)[after.steps // STEPS, 0])
         return jax.lax.cond(anew, lambda: fresh, lambda: after)
 
     def unfinished(state: _State):
@@ -382,7 +379,6 @@ def _begin(p: Prepared, start: WarmStart) -> _State:
         prices=prices,
         stiffness=jnp.where(priced, STIFF, SOFT),
         ridge=jnp.asarray(RIDGE),
-        attempt=jnp.zeros((), dtype=jnp.int32),
         steps=jnp.zeros((), dtype=jnp.int32),
         done=jnp.asarray(False),
         left=jnp.asarray(jnp.inf),
