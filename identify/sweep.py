@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from jaxmpc.errors import InputError
 from jaxmpc.process.plant import WellPlant, check_inputs, steady_state
 from jaxmpc.process.well.equations import CV_NAMES
+from jaxmpc.programs.lanes import in_pieces
 
 LIFTS = (5000.0, 7500.0, 10000.0)  # m3/h, the three curves of figures 10 and 11
 POINTS = 50  # of one call, so that all grids are solved by one program
@@ -43,14 +44,7 @@ class SteadySweep(NamedTuple):
 
 def _steady(choke, lift, parameters):
     """Steady CVs ``"point cv"`` and whether they were found."""
-    found, padded = [], (0, -len(choke) % POINTS)
-    choke, lift = np.pad(choke, padded, mode="edge"), np.pad(lift, padded, mode="edge")
-    for begin in range(0, len(choke), POINTS):
-        some = slice(begin, begin + POINTS)
-        found.append(jax.tree.map(np.asarray, _some_steady(choke[some], lift[some], parameters)))
-    cv, converged = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    used = len(cv) - padded[1]
-    return cv[:used], converged[:used]
+    return in_pieces(lambda *some: _some_steady(*some, parameters), POINTS, choke, lift)
 
 
 @jax.jit

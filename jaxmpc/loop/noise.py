@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmpc.errors import InputError
+from jaxmpc.programs.lanes import in_pieces
 
 ROWS = 4096  # samples of one call, of any lanes: one program draws them all
 
@@ -43,12 +44,7 @@ def errors_of(deviation: np.ndarray, seeds: np.ndarray, samples: int) -> np.ndar
         return np.zeros((len(deviation), samples, deviation.shape[1]))
     lanes, cvs = deviation.shape
     lane, sample = (at.ravel() for at in np.indices((lanes, samples)))
-    found = np.empty((lanes * samples, cvs))
-    for begin in range(0, len(found), ROWS):
-        row = np.minimum(np.arange(begin, begin + ROWS), len(found) - 1)
-        errors = np.asarray(_errors(deviation[lane[row]], seeds[lane[row]], sample[row]))
-        found[begin : begin + ROWS] = errors[: len(found) - begin]
-    return found.reshape(lanes, samples, cvs)
+    return in_pieces(_errors, ROWS, deviation[lane], seeds[lane], sample).reshape(lanes, samples, cvs)
 
 
 @jax.jit

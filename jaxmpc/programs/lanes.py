@@ -71,6 +71,17 @@ def lanes_of(trees: Sequence[T]) -> Lanes[T]:
     return Lanes(jax.tree.map(lambda *leaves: np.stack(leaves), *trees), nothing)
 
 
+def in_pieces(call: Callable[..., T], size: int, *arrays: np.ndarray) -> T:
+    """What a call finds for the entries of arrays, `size` at a time, so that one program serves any number of them.
+
+    The last piece is filled up with the last entry.
+    """
+    count = len(arrays[0])
+    entry = np.minimum(np.arange(-(-count // size) * size), count - 1).reshape(-1, size)
+    pieces = [jax.tree.map(np.asarray, call(*(array[own] for array in arrays))) for own in entry]
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *pieces)
+
+
 def one_by_one(function: F) -> F:
     """The function with a `jax.vmap` that on a CPU solves lane after lane, so that none pays for the slowest.
 
