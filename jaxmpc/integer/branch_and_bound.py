@@ -430,8 +430,8 @@ class _Tree:
         if not solved:
             return
         moves = np.array([result.x[lane, c.integer] for result, lane in solved])
-        moves = np.unique(np.concatenate([np.round(moves), self._walked(moves)]), axis=0)
-        moves = moves[np.isfinite(moves).all(axis=1)].astype(int)
+        moves = moves[np.isfinite(moves).all(axis=1)]
+        moves = np.unique(np.concatenate([np.round(moves), self._walked(moves)]), axis=0).astype(int)
         low, high = (whole(values[c.integer]) for values in search.limits)
         points = search.new(list(moves[satisfied(search.chains, moves, low, high)]))
         yield from self._solve_best(points)
@@ -441,13 +441,7 @@ class _Tree:
         result = np.zeros_like(moves)
         for chain in self.search.chains:
             wanted = np.cumsum(moves[:, chain.columns] * chain.counts, axis=1)
-            position = np.zeros(len(moves))
-            if chain.restricted:
-                result[:, chain.columns] = _followed(chain, wanted)
-                continue
-            for b, column in enumerate(chain.columns):
-                result[:, column] = np.round((wanted[:, b] - position) / chain.counts[b])
-                position += result[:, column] * chain.counts[b]
+            result[:, chain.columns] = _followed(chain, wanted)
         return result
 
     def _solve_best(self, points: np.ndarray) -> Steps:
@@ -545,11 +539,11 @@ class _Tree:
 
 
 def _followed(chain: Chain, wanted: np.ndarray) -> np.ndarray:
-    """Whole moves of a restricted chain along wanted positions ``"lane block"``: to the nearest allowed, with rests."""
+    """Whole moves of a chain along wanted positions ``"lane block"``: to the nearest allowed, with the rests of a dwell."""
     moves = np.zeros(wanted.shape)
     position = np.zeros(len(wanted), dtype=int)
     for b, count in enumerate(chain.counts):
-        there = np.clip(np.nan_to_num(wanted[:, b]), -1e15, 1e15)
+        there = np.clip(wanted[:, b], -1e15, 1e15)
         if chain.allowed is not None:
             below, above = chain.down(np.floor(there)), chain.up(np.ceil(there))
             there = np.where(there - below <= above - there, below, above)

@@ -185,3 +185,8 @@ def resting(structure: Structure, actuator: Actuator, mv: int) -> Bool[np.ndarra
 def whole(steps: np.ndarray) -> Int[np.ndarray, "..."]:
     """Whole steps, with `UNBOUNDED` for anything larger and for no limit."""
     return np.clip(np.round(steps), -UNBOUNDED, UNBOUNDED).astype(int)
+
+
+def rows_of(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Limits of whole positions as those of hard rows: infinite where they are `UNBOUNDED`."""
+    return np.where(low > -UNBOUNDED, low, -np.inf), np.where(high < UNBOUNDED, high, np.inf)

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from jaxmpc.errors import InputError
 from jaxmpc.integer.actuators import Actuator
-from jaxmpc.integer.chain import UNBOUNDED, chains_of, resting, whole
+from jaxmpc.integer.chain import chains_of, resting, rows_of, whole
 from jaxmpc.integer.feasible import satisfied
 from jaxmpc.integer.host_search import NOT_CLOSED, Known, SearchResult
 from jaxmpc.integer.nearest import UndecidedError, fastest_return, nearest
@@ -165,8 +165,7 @@ def _restricted(
                 with contextlib.suppress(UndecidedError):
                     reached = fastest_return(chain, whole(low[columns]), whole(high[columns])) or reached
             rows = c.position[columns]
-            row_low[i, rows] = np.where(reached[0] > -UNBOUNDED, reached[0], -np.inf)
-            row_high[i, rows] = np.where(reached[1] < UNBOUNDED, reached[1], np.inf)
+            row_low[i, rows], row_high[i, rows] = rows_of(*reached)
         lower[i, c.integer], upper[i, c.integer] = low, high
     values = lower, upper, row_low, row_high
     return eqx.tree_at(lambda i: (i.lower, i.upper, i.row_low, i.row_high), instances, values)

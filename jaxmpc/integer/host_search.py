@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from jaxmpc.integer.actuators import Actuator
-from jaxmpc.integer.chain import UNBOUNDED, Chain, chains_of, whole
+from jaxmpc.integer.chain import Chain, chains_of, rows_of, whole
 from jaxmpc.integer.feasible import satisfied
 from jaxmpc.integer.followed import followed
 from jaxmpc.integer.lower_bound import LowerModel
@@ -214,8 +214,7 @@ class Search:
         limits.lower[:, integer], limits.upper[:, integer] = lower, upper
         if positions is not None:
             rows = self.constants.position
-            limits.row_low[:, rows] = np.where(positions[0] > -UNBOUNDED, positions[0], -np.inf)
-            limits.row_high[:, rows] = np.where(positions[1] < UNBOUNDED, positions[1], np.inf)
+            limits.row_low[:, rows], limits.row_high[:, rows] = rows_of(*positions)
         if starts is None:
             stacked = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape)), self.start)
         else:
