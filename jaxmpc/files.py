@@ -51,6 +51,12 @@ def from_strict_json(value: Any) -> Any:
     return value
 
 
+def json_by_field(body: dict[str, Any], **options: Any) -> str:
+    """The text of a JSON object with a line per field; options of `json.dumps`."""
+    fields = (f" {json.dumps(key)}: {json.dumps(value, **options)}" for key, value in body.items())
+    return "{\n" + ",\n".join(fields) + "\n}\n"
+
+
 def read_json(field: str, path: str | Path) -> Any:
     """The content of a JSON file, or an `InputError` that names the path."""
     try:

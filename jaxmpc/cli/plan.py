@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import sys
 from pathlib import Path
 
 from jaxmpc.cli import options as cli
 from jaxmpc.cli.options import Options, choice, option
-from jaxmpc.files import check_target, write_atomically
+from jaxmpc.files import check_target, json_by_field, write_atomically
 
 FINISHES = ("auto", "enumeration", "highs", "branch-and-bound")
 
@@ -35,8 +34,7 @@ def plan(options: Options) -> int:
     given = {field.name: getattr(case, field.name) for field in dataclasses.fields(case)}
     with shown():
         body = plan_to_dict(solve_plan(**given, finish=options.finish))
-    fields = (f" {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in body.items())
-    text = "{\n" + ",\n".join(fields) + "\n}\n"  # one field per line
+    text = json_by_field(body, allow_nan=False)
     status, objective = body["status"], body["objective"]
     if options.out is None:
         print(text, end="", flush=True)

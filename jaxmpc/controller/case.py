@@ -115,6 +115,7 @@ _ARRAYS = {  # unit, names of the columns, number of rows and what that is
     "previous_moves": ("MV unit per sample", "mv_names", "block_count", "the number of blocks"),
 }
 _PLAIN_STRUCTURE = ("prediction_horizon", "control_horizon", "first_penalised", "blocking")
+_RARE = ("integer_values", "dwell", "integer_horizon")  # what few cases have
 _PLAN = (
     *("status", "objective", "bound", "gap", "moves", "mv", "cv", "eps_high", "eps_low"),
     *("nodes", "solve_time_s", "finished_by"),
@@ -188,8 +189,7 @@ def case_to_dict(case: Case) -> dict[str, Any]:
     logs a step passes the move limits that held in that step.
     """
     structure, model = case.structure, case.model
-    named = zip(structure.mv_names, structure.integer_horizon, strict=True)
-    horizons = {name: horizon for name, horizon in named if horizon is not None}
+    rare = {key: _by_name(structure, getattr(structure, key)) for key in _RARE}
     tuning = {key: np.asarray(getattr(case.tuning, key)).tolist() for key in _IN_STEP}
     for key, field in _IN_STEP.items():
         if field.flag:
@@ -205,17 +205,12 @@ def case_to_dict(case: Case) -> dict[str, Any]:
             **{key: getattr(structure, key) for key in _PLAIN_STRUCTURE},
             "blocks": _blocks(structure),
             "integer_step": _by_name(structure, structure.integer_step),
-            "integer_values": _by_name(structure, structure.integer_values),
-            "dwell": _by_name(structure, structure.dwell),
-            **({"integer_horizon": horizons} if horizons else {}),
+            **{key: values for key, values in rare.items() if values},
         },
         "tuning": _plain(tuning),
         **{key: np.asarray(getattr(case, key)).tolist() for key in _ARRAYS if getattr(case, key) is not None},
         "limits": {"time_s": case.time_limit, "gap": case.gap},
     }
-    for key in ("integer_values", "dwell"):  # what few cases have
-        if not body["structure"][key]:
-            del body["structure"][key]
     if case.samples_since_move is not None:
         body["samples_since_move"] = list(case.samples_since_move)
     return body
@@ -285,8 +280,7 @@ def _given_blocks(given: Any, names: tuple[str, ...]) -> tuple[Any, ...]:
         return tuple(decode(given, list[int], "structure.blocks", expected=_told))
     listed, unit = ", ".join(names), _unit("structure.blocks")
     for name, lengths in given.items():
-        if name not in names:
-            raise InputError(f"structure.blocks.{name}", lengths, f"one of the MV names {listed}")
+        _check_mv(f"structure.blocks.{name}", lengths, name, names)
     for name in names:
         if name not in given:
             raise InputError(
@@ -297,6 +291,11 @@ def _given_blocks(given: Any, names: tuple[str, ...]) -> tuple[Any, ...]:
     expected = lambda _, words: words + unit  # noqa: E731
     lists = (decode(given[name], list[int], f"structure.blocks.{name}", expected=expected) for name in names)
     return tuple(map(tuple, lists))
+
+
+def _check_mv(path: str, value: Any, name: str, names: tuple[str, ...]) -> None:
+    if name not in names:
+        raise InputError(path, value, f"one of the MV names {', '.join(names)}")
 
 
 def _given_horizon(given: int | dict[str, Any], integer: dict[str, Any], names: tuple[str, ...]) -> tuple:
@@ -324,8 +323,7 @@ def _structure(fields: _StructureFields, model: StepResponseModel) -> Structure:
         per_mv[key] = [absent] * len(model.mv_names)
         for name, value in getattr(fields, key).items():
             path = f"structure.{key}.{name}"
-            if name not in model.mv_names:
-                raise InputError(path, value, f"one of the MV names {', '.join(model.mv_names)}")
+            _check_mv(path, value, name, model.mv_names)
             if value is None:
                 raise InputError(path, value, expected)
             per_mv[key][model.mv_names.index(name)] = value

@@ -267,10 +267,8 @@ class Planner:
         if result.x is None:
             name, took = codes.STATUS[result.status], clock.seconds
             nothing: Any = (None,) * 8
-            none = Plan(
-                name, *nothing, nodes=result.nodes, solve_time_s=took, finished_by=None, reason=result.reason
-            )
-            return dataclasses.replace(none, integer_until=self._integer_until)
+            said: dict[str, Any] = dict(reason=result.reason, integer_until=self._integer_until)
+            return Plan(name, *nothing, nodes=result.nodes, solve_time_s=took, finished_by=None, **said)
         core, size = self.controllers.cores.shared, self.controllers.size
         x = np.array(result.x)
         x = np.where(np.asarray(core.qp.whole), np.round(x), x)

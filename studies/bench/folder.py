@@ -7,7 +7,6 @@ finds out what is known. docs/instances.md describes the format.
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 from jaxmpc.controller.case import Case, case_to_dict, load_case
 from jaxmpc.controller.plan import Plan, Planner
 from jaxmpc.errors import InputError
-from jaxmpc.files import read_json, write_atomically
+from jaxmpc.files import json_by_field, read_json, write_atomically
 from studies.bench.beside import ask, polished
 from studies.bench.context import Context
 from studies.bench.generate import OPTIMA, shipped_cases
@@ -61,8 +60,7 @@ def write(folder: Path, cases: dict[str, dict], known: dict[str, Known]) -> None
     """Write ``cases/NAME.json``, and ``truth.json`` with what is known."""
     files = {Path("cases", f"{name}.json"): case for name, case in cases.items()}
     for name, body in (files | {Path(TRUTH): msgspec.to_builtins(known)}).items():
-        lines = (f" {json.dumps(key)}: {json.dumps(value)}" for key, value in body.items())
-        write_atomically(folder / name, "{\n" + ",\n".join(lines) + "\n}\n")
+        write_atomically(folder / name, json_by_field(body))
 
 
 def read(folder: Path) -> tuple[dict[str, Case], dict[str, Known]]:

@@ -212,12 +212,10 @@ def _table() -> dict[str, Field]:
         shaping("mean_move_mode"),
     ]
     for name, unit in zip(MV_NAMES, MV_UNITS, strict=True):
-        for key, given in (("integer_values", {"unit": unit}), ("dwell", {})):
-            kind = (
-                dict(kind="values", low=-math.inf, high=math.inf, default=None) if given else dict(default=1)
-            )
-            label = structure[key].meaning.format(_SPOKEN[name])
-            out.append(dataclasses.replace(shaping(key, **given, **kind), key=f"{key}.{name}", label=label))
+        values = dict(kind="values", unit=unit, low=-math.inf, high=math.inf, default=None)
+        for field in (shaping("integer_values", **values), shaping("dwell", default=1)):
+            label = structure[field.key].meaning.format(_SPOKEN[name])
+            out.append(dataclasses.replace(field, key=f"{field.key}.{name}", label=label))
     for of, names, units in (("cv", CV_NAMES, CV_UNITS), ("mv", MV_NAMES, MV_UNITS), ("", ("",), ("",))):
         for key, field in TUNING.items():
             common: dict[str, Any] = dict(infinite=field.infinite, low=field.least)
