@@ -24,7 +24,6 @@ from jaxmpc.check import check_keys
 from jaxmpc.errors import InputError
 from jaxmpc.files import check_target, read_json
 from jaxmpc.model.step_response import FORMAT, StepResponseModel, make_model
-from jaxmpc.process.plant import STATE_SCALE, JaxOps, check_inputs, rates, runge_kutta, steady_state
 from jaxmpc.process.well.equations import (
     CV_NAMES,
     DEFAULT_CHOKE,
@@ -38,6 +37,7 @@ from jaxmpc.process.well.equations import (
     parameters_to_dict,
     save_parameters,
 )
+from jaxmpc.process.well.plant import STATE_SCALE, JaxOps, check_inputs, rates, runge_kutta, steady_state
 
 STEPS = (2.0, 100.0)  # choke [%] and lift [m3/h], as in the thesis
 RESPONSE_ERROR = 0.05  # standard error of a response, as a share of its peak: the model's, not the data's

@@ -18,6 +18,7 @@ import sys
 import tempfile
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +27,6 @@ from identify.fmu_source import MODEL_IDENTIFIER, fmu_files
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.files import write_atomically
 from jaxmpc.process.actuator import check_actuator, move_choke
-from jaxmpc.process.plant import STATE_SCALE, WellOutputs, check_inputs
 from jaxmpc.process.well.equations import (
     DEFAULT_CHOKE,
     DEFAULT_LIFT,
@@ -36,6 +36,7 @@ from jaxmpc.process.well.equations import (
     WellParameters,
     check_parameters,
 )
+from jaxmpc.process.well.plant import STATE_SCALE, WellOutputs, check_inputs
 from jaxmpc.programs.cache import cache_folder, read_sealed, sealed
 from jaxmpc.programs.interrupts import in_the_end, run_program
 
@@ -167,7 +168,7 @@ def validate_fmu(path: str | Path) -> list[str]:
 
 
 class FmuPlant:
-    """An FMU of the well, stepped like `jaxmpc.process.plant.WellPlant`, with its state in a process of its own.
+    """An FMU of the well, stepped like `jaxmpc.process.well.plant.WellPlant`, with its state in a process of its own.
 
     Use it as a context manager, or `close` it; that ends the process and removes the unpacked files. One
     instance serves any number of runs: `init` resets it.
@@ -272,7 +273,7 @@ class FmuPlant:
                 break
         return before
 
-    def step(self, mv, disturbance: float = 0.0) -> WellOutputs:
+    def step(self, mv, disturbance: Any = 0.0) -> WellOutputs:
         """One sample: move the actuators, hold the inputs for `dt`, and measure at the end.
 
         Args:
@@ -285,11 +286,12 @@ class FmuPlant:
         demand = np.asarray(mv, dtype=np.float64)
         if demand.shape != (2,) or not np.isfinite(demand).all():
             raise InputError("mv", mv, "choke [%] and lift [m3/h], two finite numbers")
-        if not np.isfinite(disturbance):
-            raise InputError("reservoir_pressure_offset", disturbance, "a finite pressure change [bar]")
+        offset = float(np.asarray(disturbance, dtype=np.float64).reshape(()))
+        if not np.isfinite(offset):
+            raise InputError("reservoir_pressure_offset", offset, "a finite pressure change [bar]")
         self._position = float(move_choke(self.actuator, self._position, demand[0]))
         self._lift = max(float(demand[1]), 0.0)
-        inputs = _floats(INPUT_NAMES, (self._position, self._lift, disturbance))
+        inputs = _floats(INPUT_NAMES, (self._position, self._lift, offset))
         return self._measured(self._fmu.step(self.dt, inputs, OUTPUT_NAMES))
 
     def measure(self) -> WellOutputs:

@@ -122,9 +122,9 @@ def start_state(parameters: WellParameters) -> tuple[float, ...]:
     """Steady state at 50 % and 7500 m3/h: the shipped one, or that of other parameters."""
     if parameters_to_dict(parameters) == parameters_to_dict(WellParameters()):
         return SHIPPED_STEADY_STATE
-    from jaxmpc.process.plant import WellPlant
+    from jaxmpc.process.well.plant import WellPlant
 
-    return tuple(float(v) for v in WellPlant(parameters).init().x)
+    return tuple(float(v) for v in WellPlant(parameters=parameters).init().x)
 
 
 class Variable(NamedTuple):

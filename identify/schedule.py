@@ -17,7 +17,7 @@ from identify.step_test import identify_step_response, settling_notes
 from jaxmpc.controller.schedule import ModelSchedule, make_schedule
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import StepResponseModel
-from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.plant import WellPlant
 
 # The gas gain of the choke falls from 250 to 60 m3/h per % between 7 and 20 %, and more slowly beyond. Linear interpolation
 # between these positions keeps the gains of the choke within 8 % and those of the lift within 12 % of what is

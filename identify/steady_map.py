@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 
 from identify.step_test import identity
 from identify.sweep import steady_sweep
-from jaxmpc.process.plant import WellPlant
 from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS
+from jaxmpc.process.well.plant import WellPlant
 from jaxmpc.steady.map import SteadyMap
 
 CHOKES = np.arange(2.0, 101.0, 2.0)  # %, the positions of the step choke

@@ -16,7 +16,6 @@ import numpy as np
 
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import StepResponseModel, make_model
-from jaxmpc.process.plant import WellPlant, check_inputs
 from jaxmpc.process.well.equations import (
     CV_NAMES,
     CV_UNITS,
@@ -26,6 +25,7 @@ from jaxmpc.process.well.equations import (
     MV_UNITS,
     well_hash,
 )
+from jaxmpc.process.well.plant import WellPlant, check_inputs
 
 SETTLE_SAMPLES = 60  # held at the working point before a step
 PIECE = 64  # samples of one call, so that all lengths are run by one program

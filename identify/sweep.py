@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxmpc.errors import InputError
-from jaxmpc.process.plant import WellPlant, check_inputs, steady_state
 from jaxmpc.process.well.equations import CV_NAMES
+from jaxmpc.process.well.plant import WellPlant, check_inputs, steady_state
 from jaxmpc.programs.lanes import in_pieces
 
 LIFTS = (5000.0, 7500.0, 10000.0)  # m3/h, the three curves of figures 10 and 11

@@ -38,7 +38,7 @@ _HOME_OF = {
     "Structure": "problem.structure",
     "TargetController": "controller.targets",
     "Trajectory": "loop.trajectory",
-    "WellPlant": "process.plant",
+    "WellPlant": "process.well.plant",
     "fault_errors": "controller.measurement",
     "load_controller": "controller.checkpoint",
     "make_model": "model.step_response",

@@ -15,7 +15,7 @@ from jaxmpc.errors import InputError
 from jaxmpc.files import from_strict_json, write_atomically
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.trajectory import AXES, Trajectory
-from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.plant import WellPlant
 from studies.definition.models import identify_models
 from studies.definition.scenarios import Study
 from studies.definition.sweep import StudyDefinition

@@ -76,7 +76,7 @@ SOLVES = {  # figures read results: nothing that predicts, solves or simulates
     "jaxmpc.controller.plan",
     "jaxmpc.controller.controller",
     "jaxmpc.controller.core",
-    "jaxmpc.process.plant",
+    "jaxmpc.process.well.plant",
     "jaxmpc.loop.simulate",
     "jaxmpc.steady.optimise",
 }

@@ -48,7 +48,7 @@ class Inputs(NamedTuple):
     """What comes from outside, of all scenarios."""
 
     setpoints: np.ndarray  # ``"scenario sample cv"`` [CV unit]
-    disturbance: np.ndarray  # ``"scenario sample"``
+    disturbance: np.ndarray  # ``"scenario sample disturbance"``
     errors: np.ndarray  # noise of the sensors, ``"scenario sample cv"`` [CV unit]
     faults: np.ndarray  # of the sensors, as of `measurement.fault_errors`
     told: np.ndarray  # ``"scenario"``, whether the controller is told where the actuators stand
@@ -112,7 +112,7 @@ class _Run:
     ):
         self.controllers, self.plants, self.record, self.place = controllers, plants, record, place
         self.count, self.samples = controllers.count, inputs.setpoints.shape[1]
-        outside = [inputs.setpoints, inputs.errors, inputs.faults, inputs.disturbance[..., None]]
+        outside = [inputs.setpoints, inputs.errors, inputs.faults, inputs.disturbance]
         together = np.concatenate(outside, axis=2)
         # beyond the end the last sample is repeated
         self.inputs = np.concatenate([together, np.repeat(together[:, -1:], LONGEST + 1, axis=1)], axis=1)
@@ -226,7 +226,7 @@ def _stride(leaves, packed, inputs, settings, most, form, of_now: Packing):
     now: Now = of_now.unpack(packed)
     cvs, future = now.cv.shape[1], now.moment.free_response.shape[1]
     setpoints, errors, faults = (inputs[..., k * cvs : (k + 1) * cvs] for k in range(3))
-    disturbance, told = inputs[..., -1], settings[:, 3:] > 0
+    disturbance, told = inputs[..., 3 * cvs :], settings[:, 3:] > 0
     late = now.decided[0].astype(int)  # measured is sample `late`, then late + 1, ...
 
     def carry_out(now: Now, at) -> tuple[Now, dict[str, Array]]:

@@ -38,7 +38,7 @@ def simulate_on_host(
         progress: called with ``(done, total)`` samples.
     """
     setpoints, offsets, errors, faults = (v[0] for v in inputs[:4])
-    told, total = bool(inputs.told[0]), len(setpoints)
+    told, total, named = bool(inputs.told[0]), len(setpoints), hasattr(plant, "disturbance_names")
     outputs = plant.init()
     now, mv = np.asarray(outputs.cv), np.asarray(outputs.mv)
     states: dict[int, ControllerState] = {}
@@ -64,7 +64,7 @@ def simulate_on_host(
                 carried = CarriedOut(controller.structure, record) if k == blind else None
             else:
                 record = carried.record(k - blind, cv)
-            outputs = plant.step(record["mv_demand"], float(offsets[k]))
+            outputs = plant.step(record["mv_demand"], offsets[k] if named else float(offsets[k, 0]))
             records.append(record | {"mv": np.asarray(outputs.mv)})
             if progress is not None and ((k + 1) % REPORT == 0 or k + 1 == total):
                 progress(k + 1, total)

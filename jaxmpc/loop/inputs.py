@@ -16,7 +16,7 @@ from jaxmpc.loop.compiled import Inputs
 from jaxmpc.loop.noise import check_deviation, check_seed, errors_of
 from jaxmpc.loop.reference import Reference
 from jaxmpc.problem.structure import Structure
-from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.plant import JaxPlant, disturbances_of
 from jaxmpc.programs.lanes import Lanes, for_all
 
 
@@ -25,9 +25,9 @@ class Sweep:
     """All lanes of a sweep on the host, checked."""
 
     controllers: Batch
-    plants: Lanes[WellPlant]
+    plants: Lanes[JaxPlant]
     setpoints: Sequence[np.ndarray]  # one for all, or one per lane
-    offsets: np.ndarray  # "sample" or "lane sample"
+    offsets: np.ndarray  # "sample disturbance" or "lane sample disturbance"
     deviation: np.ndarray  # "lane cv"
     seeds: np.ndarray  # "lane 2": seed and stream
     faults: np.ndarray  # "sample cv" or "lane sample cv"
@@ -60,8 +60,14 @@ class Sweep:
                 raise InputError("reference.setpoints", f"{r.cv_count} columns", expected)
         known = {r: r.sample(structure.dt, samples) for r in dict.fromkeys(references)}
         setpoints = [known[r] for r in references]
-        offsets = np.zeros(samples or 0) if disturbance is None else np.asarray(disturbance, dtype=np.float64)
-        shape = (samples or 0, structure.cv_count)
+        names, shape = disturbances_of(plants.shared), (samples or 0, structure.cv_count)
+        offsets = (
+            np.zeros((samples or 0, len(names)))
+            if disturbance is None
+            else np.asarray(disturbance, dtype=np.float64)
+        )
+        if len(names) == 1 and offsets.ndim in (1, 2) and offsets.shape[-1:] == (samples,):
+            offsets = offsets[..., None]
         failing = np.zeros(shape) if faults is None else np.asarray(faults, dtype=np.float64)
         told = np.asarray(position_feedback)
         if told.ndim > 1 or told.dtype != np.bool_:
@@ -73,7 +79,7 @@ class Sweep:
             else None,
             "plants": plants.count,
             "reference": len(references) if own_references else None,
-            "disturbance": len(offsets) if offsets.ndim == 2 else None,
+            "disturbance": len(offsets) if offsets.ndim == 3 else None,
             "noise": len(deviation) if deviation.ndim == 2 else None,
             "seed": len(seed) if seed.ndim else None,
             "faults": len(failing) if failing.ndim == 3 else None,
@@ -85,9 +91,15 @@ class Sweep:
                 "lanes", given or "none", "one number of lanes, 1 or more, in all that has lanes"
             )
         count = next(iter(given.values()))
-        shapes = (len(setpoints[0]),), (count, len(setpoints[0]))
+        shape = len(setpoints[0]), len(names)
+        shapes = shape, (count, *shape)
         if offsets.shape not in shapes or not np.isfinite(offsets).all():
-            expected = " or ".join(str(list(s)) for s in shapes) + " finite offsets [bar], one per sample"
+            each = (
+                f"one per sample and disturbance ({', '.join(names)})"
+                if names
+                else "of a plant without disturbances"
+            )
+            expected = " or ".join(str(list(s)) for s in shapes) + f" finite numbers, {each}"
             raise InputError("disturbance", f"shape {list(offsets.shape)}", expected)
         shapes = setpoints[0].shape, (count, *setpoints[0].shape)
         if failing.shape not in shapes:
@@ -117,7 +129,7 @@ class Sweep:
         """What comes from outside, of some lanes."""
         return Inputs(
             setpoints=self.setpoints_of(index),
-            disturbance=self._of(self.offsets, 2, index),
+            disturbance=self._of(self.offsets, 3, index),
             errors=errors_of(self.deviation[index], self.seeds[index], self.samples),
             faults=self._of(self.faults, 3, index),
             told=self.position_feedback[index],

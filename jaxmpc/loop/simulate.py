@@ -23,9 +23,8 @@ from jaxmpc.loop.interventions import checked_changes, checked_sample
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.trajectory import RECORDABLE, Trajectory, TrajectoryBatch
 from jaxmpc.problem.structure import Structure
-from jaxmpc.process.plant import WellPlant
-from jaxmpc.process.stateful import StatefulPlant
-from jaxmpc.process.well.host import HostWell
+from jaxmpc.process.host import HostPlant
+from jaxmpc.process.plant import JaxPlant, StatefulPlant
 from jaxmpc.programs.lanes import Lanes, for_all
 
 LANES = 256  # of a sweep that run side by side
@@ -34,11 +33,11 @@ Progress = Callable[[int, int], None]
 
 def simulate(
     controller: Controller,
-    plant: WellPlant | StatefulPlant,
+    plant: JaxPlant | StatefulPlant,
     reference: Reference,
     *,
     samples: int | None = None,
-    disturbance: Float[ArrayLike, " sample"] | None = None,
+    disturbance: Float[ArrayLike, "sample *disturbance"] | None = None,
     noise: Float[ArrayLike, " cv"] | None = None,
     seed: int = 0,
     faults: Float[ArrayLike, "sample cv"] | None = None,
@@ -51,10 +50,11 @@ def simulate(
     """Close the loop from the plant's steady state at its default working point.
 
     Args:
-        plant: `WellPlant`, or a stateful plant with `init()`, `step(mv, disturbance)` and `dt`, such as the FMU's.
+        plant: in JAX, such as `WellPlant`, or one that keeps its own state, such as an FMU (`jaxmpc.process.plant`).
         reference: setpoints, covering the run.
         samples: length of the run; the whole reference if not given.
-        disturbance: reservoir-pressure offset per sample [bar], ``"sample"``; none if not given.
+        disturbance: in every sample, ``"sample disturbance"`` in the order of the plant's `disturbance_names`; a single one
+            may go without its axis; none if not given.
         noise: standard deviation of the measurement noise, ``"cv"`` [CV unit]; none if not given.
         faults: errors of failing sensors ``"sample cv"``, from `measurement.fault_errors`; none if not given.
         position_feedback: whether the controller is told where the actuators stand, and predicts from there.
@@ -69,8 +69,8 @@ def simulate(
 
     Raises:
         InputError: if sampling intervals differ, the reference has other CVs or ends before the run, the disturbance
-            has not one finite value per sample, the noise not one standard deviation per CV, the faults not one error per
-            sample and CV, or a change does not fit.
+            has not one finite value per sample and name, the noise not one standard deviation per CV, the faults not one
+            error per sample and CV, or a change does not fit.
     """
     structure = controller.structure
     if (noise is not None and np.ndim(noise) > 1) or np.ndim(seed):
@@ -92,10 +92,10 @@ def simulate(
         blind = checked_sample("open_loop_from", open_loop_from, structure, len(setpoints))
         if takeovers and max(takeovers) > blind:
             raise InputError("open_loop_from", open_loop_from, "a time after the last of changes")
-    if isinstance(plant, WellPlant) and not takeovers and blind is None and controller.compiled:
+    if isinstance(plant, JaxPlant) and not takeovers and blind is None and controller.compiled:
         record = _one_lane(controller.lanes, plant, inputs, (*RECORDABLE, "plan"), progress)
     else:
-        host = HostWell(plant) if isinstance(plant, WellPlant) else plant
+        host = HostPlant(plant) if isinstance(plant, JaxPlant) else plant
         record = simulate_on_host(host, inputs, {0: controller, **takeovers}, blind, progress)
     plan = record.pop("plan")[:, : structure.block_count]
     kept = {"plan": plan} if keep_plans else {}
@@ -141,11 +141,11 @@ def simulate_batch(*arguments: Any, **options: Any) -> list[Trajectory]:
 
 def simulate_batches(
     controllers: Controllers | Controller,
-    plants: Lanes[WellPlant] | WellPlant,
+    plants: Lanes[JaxPlant] | JaxPlant,
     reference: Reference | Sequence[Reference],
     *,
     samples: int | None = None,
-    disturbance: Float[ArrayLike, "*lane sample"] | None = None,
+    disturbance: Float[ArrayLike, "*lane sample disturbance"] | None = None,
     noise: Float[ArrayLike, "*lane cv"] | None = None,
     seed: Int[ArrayLike, "*lane"] = 0,
     faults: Float[ArrayLike, "*lane sample cv"] | None = None,
@@ -155,7 +155,7 @@ def simulate_batches(
     devices: Sequence[Any] | None = None,
     progress: Progress | None = None,
 ) -> Iterator[TrajectoryBatch]:
-    """Closed loops on the JAX well, `lanes_at_once` side by side in one compiled program, piece by piece.
+    """Closed loops on plants in JAX, `lanes_at_once` side by side in one compiled program, piece by piece.
 
     What is given once is shared by all lanes; anything may have one value per lane instead. A piece is complete in
     time; when the next one is asked for, nothing of it is kept here, so that memory does not grow with the sweep.
@@ -163,10 +163,10 @@ def simulate_batches(
 
     Args:
         controllers: one for all, or one per lane.
-        plants: one well, or `Lanes` of wells (`lanes.per_lane`).
+        plants: one, or `Lanes` of them (`lanes.per_lane`).
         reference: setpoints for all, or a list with one reference per lane.
         samples: length of the runs; the whole (shortest) reference if not given.
-        disturbance: reservoir-pressure offset [bar], ``"sample"`` or ``"lane sample"``; none if not given.
+        disturbance: ``"sample disturbance"`` or ``"lane sample disturbance"``, as in `simulate`.
         noise: standard deviation of the measurement noise [CV unit], ``"cv"`` or ``"lane cv"``; none if not given.
         seed: of the noise. One number gives every lane noise of its own. With one number per lane, lanes with equal
             seeds get equal noise, which is that of `simulate` with this seed.

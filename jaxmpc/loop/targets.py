@@ -12,8 +12,8 @@ from jaxmpc.errors import InputError
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.trajectory import AXES, Trajectory
-from jaxmpc.process.plant import WellPlant
-from jaxmpc.process.well.host import HostWell
+from jaxmpc.process.host import HostPlant
+from jaxmpc.process.plant import JaxPlant, disturbances_of
 
 
 def simulate_with_targets(
@@ -88,14 +88,15 @@ class _Reporting:
     """A plant on the host that also measures the MVs with a target: their demands, or their positions if these are told."""
 
     def __init__(self, plant: Any, targeted: tuple[int, ...], told: bool):
-        self.plant = HostWell(plant) if isinstance(plant, WellPlant) else plant
+        self.plant = HostPlant(plant) if isinstance(plant, JaxPlant) else plant
+        self.disturbance_names = disturbances_of(plant)
         self.targeted, self.told, self.dt = list(targeted), told, plant.dt
 
     def init(self) -> _Outputs:
         outputs = self.plant.init()
         return self._report(outputs, outputs.mv)
 
-    def step(self, mv, disturbance: float = 0.0) -> _Outputs:
+    def step(self, mv, disturbance: Any = 0.0) -> _Outputs:
         return self._report(self.plant.step(mv, disturbance), mv)
 
     def _report(self, outputs, demand) -> _Outputs:

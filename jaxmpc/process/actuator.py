@@ -1,7 +1,7 @@
 """The choke actuators, part of every plant: a continuous choke, and the step choke of the thesis (chapter 6).
 
 A step choke has positions 2 % apart and moves only once the demand is far enough from where it stands.
-`jaxmpc.process.plant` and the FMU plant call these, so that a demand means the same on both.
+`jaxmpc.process.well.plant` and the FMU plant call these, so that a demand means the same on both.
 """
 
 from __future__ import annotations

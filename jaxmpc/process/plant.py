@@ -1,311 +1,106 @@
-"""The well as a plant to control: thesis 3.1 and the plant block of its figure 9, in JAX.
+"""What a closed loop asks of a plant: a JAX plant is a pure function of its state, any other keeps its own.
 
-`WellPlant` integrates the equations of `jaxmpc.process.well.equations` with RK4 between samples, holds its inputs over each
-sample, and moves the choke the way its actuator does. Everything is pure: a batch over states, inputs,
-parameters or disturbances is a `jax.vmap`. The closed loop and the identification call it; the FMU plant of
-`identify.fmu` offers the same steps on the host.
+`JaxPlant` runs inside compiled loops, many lanes side by side. A `StatefulPlant`, an FMU or a class of one's own, is
+stepped from the host; nothing has to inherit from it. Disturbances are a vector in the order of `disturbance_names`.
 """
 
-from __future__ import annotations
-
-import dataclasses
-from typing import Any, NamedTuple
+from abc import abstractmethod
+from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Int
-
-from jaxmpc.check import as_floats, is_number
-from jaxmpc.errors import InputError
-from jaxmpc.process.actuator import check_actuator, move_choke
-from jaxmpc.process.well.equations import (
-    DEFAULT_CHOKE,
-    DEFAULT_LIFT,
-    SHIPPED_STEADY_STATE,
-    WellParameters,
-    check_parameters,
-    model,
-)
-from jaxmpc.programs.numerics import largest
-
-# Typical sizes of the states, for tolerances [kg, kg, kg, kg, kg, 1, m3/h, Pa].
-STATE_SCALE = (100.0, 100.0, 100.0, 1000.0, 1000.0, 1.0, 1000.0, 1e6)
-STEADY_TOLERANCE = 1e-11  # scaled drift [1/s] below which a state counts as steady
-STEADY_HOURS = 48
-NEWTON_STEPS = 25
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
 
-class JaxOps:
-    """What `jaxmpc.process.well.equations.model` needs beyond arithmetic, for JAX arrays."""
+class Outputs(NamedTuple):
+    """What a plant measures, without noise."""
 
-    sqrt = staticmethod(jnp.sqrt)
-
-    @staticmethod
-    def positive(x):
-        """The larger of x and 0."""
-        return jnp.maximum(x, 0.0)
+    cv: Any  # ``"cv"`` [CV unit]
+    mv: Any  # ``"mv"``, where the actuators stand [MV unit]
 
 
-class WellState(eqx.Module):
-    """State of the plant."""
-
-    # the states of the well in the order and units of `jaxmpc.process.well.equations.STATES`
-    x: Float[Array, "8"]
-    position: Float[Array, ""]  # choke position after the actuator [%]
-    lift: Float[Array, ""]  # lift demand that was last applied [m3/h]
-
-
-class WellOutputs(NamedTuple):
-    """What a plant measures; JAX arrays from `WellPlant`, NumPy values from the FMU plant."""
-
-    cv: Any  # gas rate at standard conditions and oil rate [m3/h]
-    mv: Any  # choke position after the actuator [%] and lift demand [m3/h], as applied
-    wellhead_pressure: Any  # upstream of the choke [bar]
-    bottom_hole_pressure: Any  # at the perforations [bar]
-    annulus_pressure: Any  # at the top of the annulus [bar]
-    injection_pressure: Any  # in the tubing at the gas-lift valve [bar]
-    delivered_lift: Any  # what the supply delivers [m3/h]
-    choke_opening: Any  # of the choke, which follows its position with a lag [%]
-
-
-class SteadyState(NamedTuple):
-    """Result of `steady_state`."""
-
-    x: Float[Array, "8"]  # ``"8"``, the state (of the last iteration, where it did not converge)
-    outputs: WellOutputs  # `WellOutputs` at that state
-    converged: Bool[Array, ""]  # whether the scaled drift fell below `STEADY_TOLERANCE`
-    drift: Float[Array, ""]  # largest scaled rate of change left [1/s]
-    hours: Int[Array, ""]  # simulated on the way [h]
-
-
-def rates(x: Float[Array, "8"], u: Float[Array, "3"], parameters: WellParameters) -> Float[Array, "8"]:
-    """Time derivative of the well's state [state unit per second]; `u` as in `jaxmpc.process.well.equations.INPUTS`."""
-    return jnp.stack(model(JaxOps, tuple(x), tuple(u), parameters)[0])
-
-
-def runge_kutta(x: tuple, u: tuple, parameters: WellParameters, steps, substep: float) -> tuple:
-    """Integrate over `steps` classical fourth-order Runge-Kutta steps of `substep` seconds, inputs held."""
-
-    def slope(x):
-        return model(JaxOps, x, u, parameters)[0]
-
-    def ahead(x, k, h):
-        return tuple(a + h * b for a, b in zip(x, k, strict=True))
-
-    def one(_, x):
-        k1 = slope(x)
-        k2 = slope(ahead(x, k1, 0.5 * substep))
-        k3 = slope(ahead(x, k2, 0.5 * substep))
-        k4 = slope(ahead(x, k3, substep))
-        total = (a + 2 * (b + c) + d for a, b, c, d in zip(k1, k2, k3, k4, strict=True))
-        return tuple(a + substep / 6 * k for a, k in zip(x, total, strict=True))
-
-    # Eight separate values, not one array: a batch then works on whole vectors instead of strided slices.
-    return jax.lax.fori_loop(0, steps, one, x)
-
-
-def steady_state(
-    choke,
-    lift,
-    disturbance=0.0,
-    parameters: WellParameters | None = None,
-    guess: Float[Array, "8"] | None = None,
-) -> SteadyState:
-    """Steady state for held inputs: Newton's method, from states further and further along a simulation.
-
-    Newton's method alone is lost between the one-way valves, and simulation alone is slow to finish. A result
-    of Newton's method counts only if it lies near the state it started from. Where the choke is shut or
-    nearly no gas is lifted, steady states are not unique; the result is the one that the simulation from
-    `guess` settles at. A well with other parameters may have an unstable steady state (casing heading), which
-    the simulation circles; the shipped well has none.
-
-    Args:
-        choke: position [%], 0..100.
-        lift: lift rate [m3/h], 0 or more.
-        disturbance: offset of the reservoir pressure [bar].
-        parameters: of the well; the shipped ones by default.
-        guess: ``"8"``, where to start; the shipped steady state by default.
-
-    Returns:
-        `SteadyState`. Never raises: look at `converged`, per lane of a batch. Without convergence, `x` is the
-        state after `STEADY_HOURS` of simulation.
-    """
-    parameters = WellParameters() if parameters is None else parameters
-    u = jnp.stack([jnp.asarray(v, dtype=jnp.float64) for v in (choke, lift, disturbance)])
-    scale = jnp.asarray(STATE_SCALE)
-    start = jnp.asarray(SHIPPED_STEADY_STATE if guess is None else guess, dtype=jnp.float64)
-
-    def drift(s):
-        return rates(s * scale, u, parameters) / scale
-
-    def size(s):
-        return largest(drift(s))
-
-    def newton_step(count, s):
-        # The growing time step keeps the matrix regular where a state has no unique equilibrium.
-        step = 100.0 * 10.0 ** jnp.minimum(count, 12)
-        return s + jnp.linalg.solve(jnp.eye(8) / step - jax.jacfwd(drift)(s), drift(s))
-
-    def polish(s):
-        new = jax.lax.fori_loop(0, NEWTON_STEPS, newton_step, s)
-        near = largest((new - s) / (jnp.abs(s) + 0.05)) < 0.3
-        return jnp.where(near & (size(new) <= STEADY_TOLERANCE), new, s)
-
-    def unfinished(carry):
-        s, hours = carry
-        return (size(s) > STEADY_TOLERANCE) & (hours < STEADY_HOURS)
-
-    def advance(carry):
-        s, hours = carry
-        s = polish(s)
-        seconds = jnp.where(size(s) <= STEADY_TOLERANCE, 0, 3600)
-        x = runge_kutta(tuple(s * scale), tuple(u), parameters, seconds, 1.0)
-        return jnp.stack(x) / scale, hours + (seconds > 0)
-
-    # The two actuator lags are known; the other states start where the guess has them.
-    first = (start / scale).at[5].set(u[0] / 100).at[6].set(u[1] / scale[6])
-    s, hours = jax.lax.while_loop(unfinished, advance, (first, jnp.asarray(0)))
-    drifting = size(s)
-    x = s * scale
-    outputs = _outputs(x, u[0], u[1], u[2], parameters)
-    return SteadyState(x, outputs, drifting <= STEADY_TOLERANCE, drifting, hours)
-
-
-_steady_state = jax.jit(steady_state)
-
-
-def steady_state_of(choke, lift, disturbance, parameters: WellParameters) -> SteadyState:
-    """`steady_state` from the shipped one, compiled once for all numbers and plants."""
-    given = choke, lift, disturbance, parameters
-    # Python's numbers and arrays would be arguments of two kinds, each with a program
-    return _steady_state(*jax.tree.map(lambda v: jnp.asarray(v, dtype=jnp.float64), given))
-
-
-def _known(choke, lift, disturbance, parameters) -> bool:
-    """Whether the shipped steady state is the answer, so that a default start compiles no solver."""
-    here = (choke, lift, disturbance, *jax.tree.leaves(parameters))
-    there = (DEFAULT_CHOKE, DEFAULT_LIFT, 0.0, *jax.tree.leaves(WellParameters()))
-    return all(isinstance(a, (int, float)) and a == b for a, b in zip(here, there, strict=True))
-
-
-@jax.jit
-def _outputs(x, position, lift, disturbance, parameters) -> WellOutputs:
-    _, y = model(JaxOps, tuple(x), (position, lift, disturbance), parameters)
-    return WellOutputs(jnp.stack(y[:2]), jnp.stack([position, lift]), *y[2:])
-
-
-class WellPlant(eqx.Module):
-    """The well with its actuators, sampled every `dt` seconds.
-
-    Attributes:
-        parameters: of the well; batch them to batch wells.
-        dt: sampling interval [s].
-        substep: integration step [s]; `dt` is a whole number of these.
-        actuator: ``continuous`` or ``step``.
-    """
-
-    parameters: WellParameters = WellParameters()
-    dt: float = eqx.field(static=True, default=10.0)
-    substep: float = eqx.field(static=True, default=1.0)
-    actuator: str = eqx.field(static=True, default="continuous")
-
-    def __check_init__(self):
-        for name in ("dt", "substep"):
-            value = getattr(self, name)
-            if not is_number(value) or value <= 0:
-                raise InputError(f"plant.{name}", value, "a positive number of seconds")
-        if abs(self.dt / self.substep - self.steps) > 1e-9 or self.steps < 1:
-            raise InputError("plant.dt", self.dt, f"a whole number of substeps of {self.substep} s")
-        check_actuator(self.actuator, "plant.actuator")
-        if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(self.parameters)):
-            check_parameters(self.parameters, "plant.parameters")
+class PlantOutputs(Protocol):
+    """What a plant measures at the end of a sample; more than `Outputs` is allowed."""
 
     @property
-    def steps(self) -> int:
-        """Number of integration steps in one sample."""
-        return round(self.dt / self.substep)
+    def cv(self) -> Any:
+        """``"cv"``, the CVs without noise [CV unit]."""
+        ...
 
-    def init(self, choke=DEFAULT_CHOKE, lift=DEFAULT_LIFT, disturbance=0.0) -> WellState:
-        """Steady state at the given inputs; the stored one for the shipped well at its working point.
+    @property
+    def mv(self) -> Any:
+        """``"mv"``, where the actuators stand [MV unit]."""
+        ...
 
-        Args:
-            choke: position [%], 0..100 (the step choke starts wherever this is).
-            lift: lift rate [m3/h], 0 or more.
-            disturbance: offset of the reservoir pressure [bar].
 
-        Raises:
-            InputError: for inputs outside their range (not when they are traced).
-        """
-        check_inputs(choke, lift, disturbance)
-        if _known(choke, lift, disturbance, self.parameters):
-            x = jnp.asarray(SHIPPED_STEADY_STATE, dtype=jnp.float64)
-        else:
-            x = steady_state_of(choke, lift, disturbance, self.parameters).x
-        return WellState(x, jnp.asarray(choke, dtype=jnp.float64), jnp.asarray(lift, dtype=jnp.float64))
+class JaxPlant(eqx.Module):
+    """A plant in JAX, sampled every `dt` seconds; its methods are pure and may be vmapped."""
 
+    dt: eqx.AbstractVar[float]
+    disturbance_names: eqx.AbstractVar[tuple[str, ...]]
+
+    @abstractmethod
+    def init(self) -> Any:
+        """The steady state at the plant's working point."""
+
+    @abstractmethod
     def step(
-        self, state: WellState, mv: Float[Array, "2"], disturbance: Any = 0.0
-    ) -> tuple[WellState, WellOutputs]:
+        self, state: Any, mv: Float[Array, " mv"], disturbance: Float[Array, " disturbance"]
+    ) -> tuple[Any, Any]:
         """One sample: move the actuators, hold the inputs for `dt`, and measure at the end.
 
         Args:
-            mv: choke demand [%] (limited to 0..100 by the choke) and lift demand [m3/h] (0 or more).
-            disturbance: offset of the reservoir pressure during the sample [bar].
+            state: from `init` or the step before.
+            mv: demands [MV unit].
+            disturbance: during the sample, in the order of `disturbance_names`.
 
         Returns:
-            ``(state, outputs)`` at the end of the sample. Not a number in gives not a number out.
+            ``(state, outputs)``; the outputs have `cv` and `mv` as `Outputs` has.
         """
-        mv = jnp.asarray(mv, dtype=jnp.float64)
-        position = jnp.asarray(move_choke(self.actuator, state.position, mv[0]))
-        lift = jnp.maximum(mv[1], 0.0)
-        offset = jnp.asarray(disturbance, dtype=jnp.float64)
-        u = (position, lift, offset)
-        x = jnp.stack(runge_kutta(tuple(state.x), u, self.parameters, self.steps, self.substep))
-        return WellState(x, position, lift), _outputs(x, position, lift, offset, self.parameters)
 
-    def measure(self, state: WellState, disturbance=0.0) -> WellOutputs:
-        """What the plant measures in `state`, without advancing it."""
-        offset = jnp.asarray(disturbance, dtype=jnp.float64)
-        return _outputs(state.x, state.position, state.lift, offset, self.parameters)
+    @abstractmethod
+    def measure(self, state: Any) -> Any:
+        """What the plant measures in `state`, without advancing it and undisturbed."""
 
     def run(
-        self, state: WellState, mv: Float[Array, "sample 2"], disturbance=0.0
-    ) -> tuple[WellState, WellOutputs]:
+        self, state: Any, mv: Float[ArrayLike, "sample mv"], disturbance: ArrayLike = 0.0
+    ) -> tuple[Any, Any]:
         """Apply a sequence of inputs, one row per sample.
 
         Args:
-            mv: ``"sample 2"``, choke [%] and lift [m3/h] demands.
-            disturbance: one offset [bar], or one per sample.
+            mv: ``"sample mv"``, demands [MV unit].
+            disturbance: one number for all, one per sample, or ``"sample disturbance"``.
 
         Returns:
             ``(state, outputs)``: the state after the last sample, and outputs with a leading sample axis.
         """
         mv = jnp.asarray(mv, dtype=jnp.float64)
-        offsets = jnp.broadcast_to(jnp.asarray(disturbance, dtype=jnp.float64), mv.shape[:1])
-        return jax.lax.scan(lambda s, now: self.step(s, now[0], now[1]), state, (mv, offsets))
-
-    def with_actuator(self, actuator: str) -> WellPlant:
-        """The same well with another choke actuator."""
-        return dataclasses.replace(self, actuator=actuator)
+        given = jnp.asarray(disturbance, dtype=jnp.float64)
+        given = given[:, None] if given.ndim == 1 else given
+        rows = jnp.broadcast_to(given, (mv.shape[0], len(self.disturbance_names)))
+        return jax.lax.scan(lambda s, now: self.step(s, now[0], now[1]), state, (mv, rows))
 
 
-def check_inputs(choke, lift, disturbance=0.0) -> None:
-    """Refuse inputs that are not finite or outside their range; traced values pass.
+class StatefulPlant(Protocol):
+    """A plant that is stepped from the host; without `disturbance_names` it has a single disturbance."""
 
-    Raises:
-        InputError: naming the input, its value, and the range with its unit.
-    """
-    limits = (
-        ("choke", choke, 0.0, 100.0, "a position in 0..100 %"),
-        ("gas_lift", lift, 0.0, np.inf, "a lift rate of 0 m3/h or more, finite"),
-        ("reservoir_pressure_offset", disturbance, -np.inf, np.inf, "a finite pressure change [bar]"),
-    )
-    for name, value, low, high, expected in limits:
-        if isinstance(value, Tracer):
-            continue
-        number = as_floats(name, value, expected)
-        if not np.isfinite(number).all() or (number < low).any() or (number > high).any():
-            raise InputError(name, value, expected)
+    @property
+    def dt(self) -> float:
+        """Sampling interval [s]."""
+        ...
+
+    def init(self) -> PlantOutputs:
+        """Start at the plant's working point; what it measures there."""
+        ...
+
+    def step(self, mv: np.ndarray, disturbance: Any, /) -> PlantOutputs:
+        """One sample with these demands ``"mv"`` [MV unit] and disturbances; what is measured at its end."""
+        ...
+
+
+def disturbances_of(plant: Any) -> tuple[str, ...]:
+    """Names of the disturbances of a plant of any kind."""
+    return tuple(getattr(plant, "disturbance_names", ("disturbance",)))

@@ -17,9 +17,10 @@ from jaxmpc.errors import InputError
 
 F = TypeVar("F", bound=Callable)
 T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
 
 
-class Lanes(eqx.Module, Generic[T]):
+class Lanes(eqx.Module, Generic[T_co]):
     """A batch of `T`, split into arrays with a leading lane axis and everything else."""
 
     each: Any  # a `T` with the arrays that have a lane axis, None in all other places
@@ -34,7 +35,7 @@ class Lanes(eqx.Module, Generic[T]):
         return sizes.pop() if sizes else None
 
     @property
-    def value(self) -> T:
+    def value(self) -> T_co:
         """The `T` whose arrays have a lane axis where `each` has them."""
         return eqx.combine(self.each, self.shared)
 
@@ -44,11 +45,11 @@ class Lanes(eqx.Module, Generic[T]):
             self.each, *arguments
         )
 
-    def lane(self, k: int) -> T:
+    def lane(self, k: int) -> T_co:
         """The `T` of lane k alone."""
         return eqx.combine(jax.tree.map(lambda leaf: leaf[k], self.each), self.shared)
 
-    def take(self, index: np.ndarray) -> Lanes[T]:
+    def take(self, index: np.ndarray) -> Lanes[T_co]:
         """The lanes at these positions, repeats allowed; their arrays are NumPy's."""
         return Lanes(jax.tree.map(lambda leaf: np.asarray(leaf)[index], self.each), self.shared)
 

@@ -25,9 +25,9 @@ from jaxmpc.loop.simulate import simulate
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
-from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.host import HostPlant
 from jaxmpc.process.well.equations import well_hash
-from jaxmpc.process.well.host import HostWell
+from jaxmpc.process.well.plant import WellPlant
 from jaxmpc.programs.cache import cache_folder, read_sealed, sealed
 from studies.bench.judge import taken
 from studies.definition import presets
@@ -130,7 +130,7 @@ class Recordings:
         """The run made now, once per benchmark: its times are of this machine and code."""
         if (kind, mode) not in self._live:
             self.say(f"{kind} run, {mode}, stepped from the host")
-            made = self._run(kind, mode, HostWell(WellPlant(actuator="step")))
+            made = self._run(kind, mode, HostPlant(WellPlant(actuator="step")))
             self._live[kind, mode] = made
             path = self.path(kind, mode)
             if _load(path) is None:

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable
 from identify.step_test import identify_step_response
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import StepResponseModel
-from jaxmpc.process.plant import check_inputs, steady_state_of
 from jaxmpc.process.well.equations import WellParameters
+from jaxmpc.process.well.plant import check_inputs, steady_state_of
 from studies.definition.refusing import require
 
 Point = tuple[float, float]

@@ -20,8 +20,8 @@ from jaxmpc.loop.reference import Reference
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.problem.tuning import LIMIT_PAIRS
-from jaxmpc.process.plant import check_inputs
 from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES, WellParameters, check_parameters
+from jaxmpc.process.well.plant import check_inputs
 from studies.definition import presets, references
 from studies.definition.axes import AxisTable
 from studies.definition.fields import FIELDS, PLANT_FIELDS, SHIPPED, plant_si

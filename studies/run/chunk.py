@@ -23,8 +23,8 @@ from jaxmpc.loop.simulate import simulate_batches
 from jaxmpc.loop.trajectory import TrajectoryBatch
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.tuning import stack_tunings
-from jaxmpc.process.plant import WellPlant
 from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS
+from jaxmpc.process.well.plant import WellPlant
 from jaxmpc.programs.clock import Clock
 from jaxmpc.programs.lanes import Lanes
 from studies.definition.models import Point, identify_models

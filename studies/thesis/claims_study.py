@@ -16,8 +16,8 @@ import numpy as np
 
 from jaxmpc.files import write_atomically
 from jaxmpc.model.step_response import StepResponseModel
-from jaxmpc.process.plant import WellPlant
-from jaxmpc.process.well.host import HostWell
+from jaxmpc.process.host import HostPlant
+from jaxmpc.process.well.plant import WellPlant
 from studies.definition.comparison import ComparisonDefinition, PlantKind, ReferenceDefinition
 from studies.run.comparison import is_current, run_controller
 from studies.store.reading import open_results
@@ -130,5 +130,5 @@ def step_times(
     reference = ReferenceDefinition(whole.times[:count], whole.setpoints[:count], duration)
     part = msgspec.structs.replace(definition, reference=reference)
     controller = next(one for one in definition.controllers if one.name == name)
-    well = lambda actuator: HostWell(WellPlant(actuator=actuator))  # noqa: E731
+    well = lambda actuator: HostPlant(WellPlant(actuator=actuator))  # noqa: E731
     return np.asarray(run_controller(controller, part, model, well, progress).solve_time)

@@ -17,7 +17,7 @@ from identify.fmu import FmuPlant, build_fmu
 from identify.schedule import identify_schedule
 from identify.step_test import identify_step_response, identity, settling_notes
 from identify.sweep import steady_sweep
-from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.plant import WellPlant
 from studies.definition.comparison import PLANTS, ComparisonDefinition, PlantKind
 from studies.definition.refusing import require
 from studies.run.comparison import closing, labelled, run_comparison

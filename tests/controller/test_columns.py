@@ -21,7 +21,7 @@ from jaxmpc.loop.simulate import simulate
 from jaxmpc.problem.blocking import sample_moves
 from jaxmpc.problem.layout import Size, layout_of
 from jaxmpc.problem.structure import Structure
-from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.plant import WellPlant
 from tests import problems
 from tests.controller.test_plan import FINISHES, solve
 from tests.five_controllers import START, tuned

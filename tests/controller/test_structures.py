@@ -12,7 +12,7 @@ from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.errors import InputError
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import simulate, simulate_batches
-from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.plant import WellPlant
 from tests.five_controllers import START, tuned
 
 SETPOINTS = START[0] + np.array(

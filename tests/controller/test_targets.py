@@ -19,7 +19,7 @@ from jaxmpc.model.step_response import make_model
 from jaxmpc.problem.blocking import sample_moves
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import make_tuning, stack_tunings
-from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.plant import WellPlant
 
 CV, MV = np.array([11000.0, 185.0]), np.array([50.0, 7500.0])
 SETPOINT, TARGET = CV + np.array([-600.0, -3.0]), np.array([46.0, 6900.0])

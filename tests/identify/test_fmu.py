@@ -21,8 +21,8 @@ import identify.fmu as fmu_module
 from identify.fmu import FmuPlant, build_fmu, validate_fmu
 from identify.fmu_source import INPUT_SEQUENCE, fmu_files
 from jaxmpc.errors import InputError, MissingToolError
-from jaxmpc.process.plant import WellPlant, WellState, steady_state_of
 from jaxmpc.process.well.equations import SHIPPED_STEADY_STATE, WellParameters
+from jaxmpc.process.well.plant import WellPlant, WellState, steady_state_of
 from tests.process.test_plant import random_demands
 
 PLANT = WellPlant()

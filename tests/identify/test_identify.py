@@ -15,8 +15,8 @@ from identify.step_test import identify_step_response, settling, settling_notes
 from identify.sweep import steady_sweep
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.model.step_response import StepResponseModel
-from jaxmpc.process.plant import STATE_SCALE, WellPlant, rates, steady_state
 from jaxmpc.process.well.equations import WellParameters, load_parameters, parameters_to_dict
+from jaxmpc.process.well.plant import STATE_SCALE, WellPlant, rates, steady_state
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data" / "single_well_step_response.json"
 

@@ -10,7 +10,7 @@ from jaxmpc import status
 from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import simulate, simulate_batch
-from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.plant import WellPlant
 from studies.definition import presets
 
 SAMPLES, DWELL = 70, 4

@@ -19,9 +19,9 @@ from jaxmpc.loop.compiled import _Run
 from jaxmpc.loop.noise import noise_samples
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import simulate, simulate_batch, simulate_batches
-from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.host import HostPlant
 from jaxmpc.process.well.equations import WellParameters
-from jaxmpc.process.well.host import HostWell
+from jaxmpc.process.well.plant import WellPlant
 from jaxmpc.programs.lanes import per_lane
 from studies.definition import presets
 
@@ -308,7 +308,7 @@ class OnTheHost:
     """The JAX well as a plant of one's own, so that the loop runs on the host."""
 
     def __init__(self, plant):
-        self.well, self.dt = HostWell(plant), plant.dt
+        self.well, self.dt = HostPlant(plant), plant.dt
 
     def init(self):
         return self.well.init()

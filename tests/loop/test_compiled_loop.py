@@ -11,7 +11,7 @@ from jaxmpc.loop import compiled
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import simulate, simulate_batch
 from jaxmpc.loop.trajectory import RECORDABLE
-from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.plant import WellPlant
 from studies.definition import presets
 
 SAMPLES = 90  # more than one call of the longest length

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from jaxmpc.errors import InputError
 from jaxmpc.process.actuator import move_choke, step_choke
-from jaxmpc.process.plant import WellPlant, WellState, steady_state, steady_state_of
 from jaxmpc.process.well.equations import SHIPPED_STEADY_STATE, WellParameters
+from jaxmpc.process.well.plant import WellPlant, WellState, steady_state, steady_state_of
 
 PLANT = WellPlant()
 run = jax.jit(PLANT.run)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from jaxmpc.errors import InputError
-from jaxmpc.process.plant import JaxOps, rates, steady_state
 from jaxmpc.process.well.equations import (
     SHIPPED_STEADY_STATE,
     STATES,
@@ -21,6 +20,7 @@ from jaxmpc.process.well.equations import (
     save_parameters,
     well_hash,
 )
+from jaxmpc.process.well.plant import JaxOps, rates, steady_state
 
 CHOKES = (4.0, 10.0, 20.0, 30.0, 50.0, 70.0, 100.0)
 LIFTS = (5000.0, 7500.0, 10000.0)

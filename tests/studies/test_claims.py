@@ -525,7 +525,7 @@ def test_steps_are_timed_once_and_then_read_from_a_file(tmp_path, monkeypatch):
 
 def test_a_run_is_timed_on_the_host_over_its_first_part(monkeypatch):
     from identify.step_test import identify_step_response
-    from jaxmpc.process.plant import WellPlant
+    from jaxmpc.process.well.plant import WellPlant
 
     monkeypatch.setattr(claims_study, "TIMED", 60.0)
     study = catalogue.STUDIES["unblocked"](True, "jax")

@@ -14,7 +14,7 @@ from jaxmpc import status
 from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
 from jaxmpc.problem.tuning import make_tuning
-from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.plant import WellPlant
 from studies.definition import presets
 from studies.definition.comparison import ComparisonDefinition, ControllerDefinition, ReferenceDefinition
 from studies.run import comparison

@@ -14,7 +14,7 @@ from jaxmpc.controller.plan import Planner
 from jaxmpc.errors import InputError
 from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import simulate
-from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.plant import WellPlant
 from studies.definition import comparison as definition
 from studies.definition import presets
 from studies.run import comparison

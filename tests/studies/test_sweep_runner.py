@@ -16,7 +16,7 @@ from jaxmpc import simulate, stack_tunings
 from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.loop.trajectory import TrajectoryBatch
-from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.plant import WellPlant
 from studies import load
 from studies.definition import scenarios
 from studies.definition.sweep import StudyDefinition

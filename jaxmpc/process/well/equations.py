@@ -4,7 +4,7 @@ It stands in for the proprietary simulator of the thesis (3.2). The model follow
 gas-lift models (annulus gas, tubing gas and liquid, valve equations: Eikrem, Aamo, Imsland and Foss;
 Jahanshahi and Skogestad; Krishnamoorthy et al.) with two tubing sections, phase slip, a near-well pressure
 and a drooping lift supply. `model` uses nothing but arithmetic and the two functions in `ops`, so that
-`jaxmpc.process.plant` runs it with `jax.numpy` and the FMU source is generated from it with SymPy.
+`jaxmpc.process.well.plant` runs it with `jax.numpy` and the FMU source is generated from it with SymPy.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from jaxmpc.controller.controller import Controllers
 from jaxmpc.loop.simulate import simulate_batch
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
-from jaxmpc.process.plant import WellPlant
+from jaxmpc.process.well.plant import WellPlant
 from studies.bench.context import Context
 from studies.bench.instances import Kind, Mode, Recording, make_controller
 from studies.bench.judge import taken
