@@ -31,7 +31,7 @@ _HOME_OF = {
     "Controller": "controller.controller",
     "Controllers": "controller.controller",
     "InputError": "errors",
-    "Reference": "loop.reference",
+    "Reference": "process.reference",
     "SensorFault": "controller.measurement",
     "SteadyMap": "steady.map",
     "StepResponseModel": "model.step_response",

@@ -20,7 +20,7 @@ from jaxmpc.loop.compiled import Inputs, simulate_compiled
 from jaxmpc.loop.host import simulate_on_host
 from jaxmpc.loop.inputs import Sweep
 from jaxmpc.loop.interventions import checked_changes, checked_sample
-from jaxmpc.loop.reference import Reference
+from jaxmpc.process.reference import Reference
 from jaxmpc.loop.trajectory import RECORDABLE, Trajectory, TrajectoryBatch
 from jaxmpc.problem.structure import Structure
 from jaxmpc.process.host import HostPlant

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxmpc.controller.targets import TargetController
 from jaxmpc.errors import InputError
-from jaxmpc.loop.reference import Reference
+from jaxmpc.process.reference import Reference
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.trajectory import AXES, Trajectory
 from jaxmpc.process.host import HostPlant

@@ -7,7 +7,7 @@ import functools
 from collections.abc import Callable
 
 from identify.step_test import identify_step_response
-from jaxmpc.loop.reference import Reference
+from jaxmpc.process.reference import Reference
 from jaxmpc.model.step_response import StepResponseModel
 from studies.bench.instances import MODES, Mode, Recordings
 from studies.bench.peers import Peer

@@ -20,7 +20,7 @@ import numpy as np
 from jaxmpc.controller.case import Case, case_to_dict
 from jaxmpc.controller.controller import Controller
 from jaxmpc.files import write_atomically
-from jaxmpc.loop.reference import Reference
+from jaxmpc.process.reference import Reference
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure

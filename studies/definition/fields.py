@@ -1,14 +1,14 @@
 """The keys of a sweep study: everything that `[base]` can set and an axis can vary, with unit, meaning and default.
 
-A key is the path of the setting below `[base]`, for example ``tuning.deadzone.gas_rate``. `FIELDS` is the one table of them:
-the definition is checked against it, axes take their units and labels from it, and `docs/studies.md` lists it.
+A key is the path of the setting below `[base]`, for example ``tuning.deadzone.NAME`` of a CV. `study_fields` makes the one table
+of them for a process: definitions are checked against it, axes take units and labels from it, `docs/studies.md` lists it.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from decimal import Decimal
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -19,8 +19,8 @@ from jaxmpc.problem.declared import declared
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.problem.values import checked_values
-from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS, WellParameters
-from studies.definition import presets, references
+from jaxmpc.process.plant import Parameter
+from jaxmpc.process.process import BLOCKING, Process
 
 LONGEST = 10_000  # samples of a horizon; more would not fit into memory
 Kind = Literal["number", "whole", "flag", "text", "lengths", "values"]
@@ -41,6 +41,7 @@ class Field:
     infinite: bool = False  # whether infinity is accepted, as a limit that does not bind
     low: float = -math.inf  # accepted range, as far as it does not follow from the typed objects
     high: float = math.inf
+    names: tuple[str, ...] = ()  # of the MVs, where the value may be one list for each of them
 
     @property
     def numeric(self) -> bool:
@@ -55,7 +56,7 @@ class Field:
         if self.kind == "text":
             return "one of " + ", ".join(self.choices)
         if self.kind == "lengths":
-            own = " and ".join(MV_NAMES)
+            own = " and ".join(self.names)
             return (
                 f"lengths of blocks in whole samples, 1 or more and {LONGEST} together at most, such as [1, 1, 2, 4], "
                 f"or a list of them for each of {own}"
@@ -81,10 +82,10 @@ class Field:
             hint = near(value, self.choices) if not good else ""
         elif self.kind == "lengths":
             if isinstance(value, dict):
-                value = [value[name] for name in MV_NAMES] if set(value) == set(MV_NAMES) else None
+                value = [value[name] for name in self.names] if set(value) == set(self.names) else None
             own = isinstance(value, (list, tuple)) and any(isinstance(v, (list, tuple)) for v in value)
             lists = tuple(value or ()) if own else (value,)
-            good = len(lists) == (len(MV_NAMES) if own else 1) and all(map(_are_lengths, lists))
+            good = len(lists) == (len(self.names) if own else 1) and all(map(_are_lengths, lists))
             value = tuple(map(tuple, lists)) if good and own else value
         elif self.kind == "values":
             return checked_values(path, value)
@@ -149,61 +150,45 @@ def _are_lengths(value: Any) -> bool:
     return good and all(isinstance(v, int) and v >= 1 for v in value) and 1 <= sum(value) <= LONGEST
 
 
-# -------------------------------------------------------------------------------------------------------- the well
-
-_PRESSURES = ("reservoir_pressure", "manifold_pressure", "supply_pressure", "supply_droop", "supply_limit")
-_IN_UNIT = {
-    "bar": (*_PRESSURES, "trip_start", "trip_end", "root_width"),
-    "kg/s/bar": ("productivity",),
-    "m": ("tubing_length", "tubing_diameter", "perforation_depth"),
-    "m2": ("choke_conductance", "injection_conductance"),
-    "m3": ("annulus_volume",),
-    "m3/m3": ("gas_oil_ratio",),
-    "m/s": ("slip_velocity", "slip_floor"),
-    "s": ("near_well_time", "choke_time", "lift_time"),
-    "1/s": ("equalising_rate",),
-    "K": ("tubing_temperature", "annulus_temperature"),
-    "kg/m3": ("liquid_density",),
-    "kg/mol": ("molar_mass",),
-}
-PLANT_UNITS = {name: unit for unit, names in _IN_UNIT.items() for name in names}  # of the others: 1
-SI_POWERS = {"bar": 5, "kg/s/bar": -5}  # of ten, of the units that are no SI units
-PLANT_FIELDS = tuple(field.name for field in dataclasses.fields(WellParameters))
-SHIPPED = {name: float(getattr(WellParameters(), name)) for name in PLANT_FIELDS}  # SI units
-
-
-def plant_si(name: str, value: float) -> float:
-    """A well parameter in SI units; shifting the decimal point keeps 78.2901 bar equal to 7829010 Pa."""
-    power = SI_POWERS.get(PLANT_UNITS.get(name, "1"), 0)
-    return float(Decimal(repr(float(value))).scaleb(power)) if power else float(value)
-
-
 # ------------------------------------------------------------------------------------------------------- the table
 
-_SPOKEN = {
-    name: "the " + {"gas_lift": "gas lift"}.get(name, name.replace("_", " "))
-    for name in (*CV_NAMES, *MV_NAMES)
-}
+
+def study_fields(process: Process, parameters: Sequence[Parameter]) -> dict[str, Field]:
+    """Every key of studies of a process, in the order of the documentation.
+
+    Args:
+        parameters: of the plant, which studies may set and vary.
+    """
+    fields = [
+        *_controller_fields(process),
+        *_tuning_fields(process),
+        *_model_fields(process),
+        *_plant_fields(parameters),
+        *_run_fields(process),
+    ]
+    return {field.key: field for field in fields}
 
 
-def _table() -> dict[str, Field]:
-    structure = declared(Structure)
+def _controller_fields(process: Process) -> list[Field]:
+    structure, defaults = declared(Structure), process.structure_fields
+    whole = bool(process.stepped)
+    kinds = ("continuous", "mixed-integer")[: 1 + whole]
 
     def shaping(key: str, **more: Any) -> Field:
         """A field of the structure, in whole samples where it is not one of a few texts."""
         field = structure[key]
         given: dict[str, Any] = dict(kind="text", choices=field.choices)
         given = given if field.choices else dict(kind="whole", low=1, high=LONGEST)
-        given |= dict(unit=field.unit, default=field.default, shape=True)
-        return Field(key, field.meaning.format(_SPOKEN["choke"]), **(given | more))
+        given |= dict(unit=field.unit, default=defaults.get(key, field.default), shape=True)
+        return Field(key, field.meaning.format("the MV"), **(given | more))
 
     out = [
-        Field("controller", "controller", "", "text", "mixed-integer", ("continuous", "mixed-integer"), True),
-        Field("actuator", "choke actuator", "", "text", "step", ("continuous", "step"), True),
-        Field("preset", "tuning preset", "", "text", "thesis", tuple(presets.TUNINGS)),
+        Field("controller", "controller", "", "text", kinds[-1], kinds, True),
+        Field("actuator", "actuators", "", "text", "step", ("continuous", "step"), True),
+        Field("preset", "tuning preset", "", "text", process.default_preset, tuple(process.presets)),
         Field("soft", "Soft MPC", "", "flag", True),
-        shaping("blocking", choices=("moves", "inputs", "none")),
-        shaping("blocks", kind="lengths", unit=""),
+        shaping("blocking", choices=BLOCKING),
+        shaping("blocks", kind="lengths", unit="", names=process.mv_names),
         shaping("prediction_horizon"),
         shaping("control_horizon", default=None),
         shaping("first_penalised"),
@@ -211,53 +196,83 @@ def _table() -> dict[str, Field]:
         shaping("mean_move_window"),
         shaping("mean_move_mode"),
     ]
-    for name, unit in zip(MV_NAMES, MV_UNITS, strict=True):
-        values = dict(kind="values", unit=unit, low=-math.inf, high=math.inf, default=None)
+    for mv in process.mvs:
+        values = dict(kind="values", unit=mv.unit, low=-math.inf, high=math.inf, default=None)
         for field in (shaping("integer_values", **values), shaping("dwell", default=1)):
-            label = structure[field.key].meaning.format(_SPOKEN[name])
-            out.append(dataclasses.replace(field, key=f"{field.key}.{name}", label=label))
-    for of, names, units in (("cv", CV_NAMES, CV_UNITS), ("mv", MV_NAMES, MV_UNITS), ("", ("",), ("",))):
+            label = structure[field.key].meaning.format(f"the {mv.label}")
+            out.append(dataclasses.replace(field, key=f"{field.key}.{mv.name}", label=label))
+    return out
+
+
+def _tuning_fields(process: Process) -> list[Field]:
+    out: list[Field] = []
+    for of, variables in (("cv", process.cvs), ("mv", process.mvs)):
         for key, field in TUNING.items():
             common: dict[str, Any] = dict(infinite=field.infinite, low=field.least)
-            for name, unit in zip(names, units, strict=True) if field.of == of and not field.flag else ():
-                label = field.meaning.format(_SPOKEN.get(name))
-                out.append(Field(f"tuning.{key}.{name}".rstrip("."), label, field.unit_of(unit), **common))
+            for v in variables if field.of == of and not field.flag else ():
+                label = field.meaning.format(f"the {v.label}")
+                out.append(Field(f"tuning.{key}.{v.name}", label, field.unit_of(v.unit), **common))
     out += [
-        Field(f"tuning.{key}", field.meaning, "", "flag", True) for key, field in TUNING.items() if field.flag
+        Field(f"tuning.{key}", field.meaning, field.unit, infinite=field.infinite, low=field.least)
+        for key, field in TUNING.items()
+        if not field.of
     ]
-    out += [
-        # the step test moves the choke by 2 % from here, and stays within its range
-        Field("model.choke", "choke of the model's working point", "%", default=50.0, low=0, high=98),
-        Field("model.lift", "gas lift of the model's working point", "m3/h", default=7500.0, low=0),
+    flags = [(key, field.meaning) for key, field in TUNING.items() if field.flag]
+    return out + [Field(f"tuning.{key}", meaning, "", "flag", True) for key, meaning in flags]
+
+
+def _model_fields(process: Process) -> list[Field]:
+    """The working point of the step test; nothing to choose where the model is a file."""
+    out = []
+    for mv in process.mvs if not process.model.file else ():
+        step = abs(process.model.steps[mv.name])  # the step test goes that far, and stays within the range
+        label, at = f"{mv.label} of the model's working point", process.model.working_point[mv.name]
+        out.append(Field(f"model.{mv.name}", label, mv.unit, default=at, low=mv.low, high=mv.high - step))
+    return out
+
+
+def _plant_fields(parameters: Sequence[Parameter]) -> list[Field]:
+    out = []
+    for p in parameters:
+        out.append(Field(f"plant.{p.name}", f"{p.label} of the plant", p.unit, default=p.default))
+        out.append(Field(f"plant_scale.{p.name}", f"{p.label} of the plant, relative", "1", low=0))
+    return out
+
+
+def _run_fields(process: Process) -> list[Field]:
+    out = [
+        Field(f"noise.{cv.name}", f"noise of the {cv.label}", cv.unit, default=0.0, low=0) for cv in process.cvs
     ]
-    for name in PLANT_FIELDS:
-        label = name.replace("_", " ")
-        out.append(Field(f"plant.{name}", f"{label} of the well", PLANT_UNITS.get(name, "1")))
-        out.append(Field(f"plant_scale.{name}", f"{label} of the well, relative", "1", low=0))
-    for name, unit in zip(CV_NAMES, CV_UNITS, strict=True):
-        out.append(Field(f"noise.{name}", f"noise of {_SPOKEN[name]}", unit, default=0.0, low=0))
+    units = {disturbance.unit for disturbance in process.disturbances}
     out += [
         Field("seed", "seed of the noise", "1", "whole", 0, low=0, high=2**32 - 1),
         Field("sensor_fault.time", "time of the sensor fault", "s", low=0),
         Field("sensor_fault.duration", "duration of the sensor fault", "s", low=0),
         Field("sensor_fault.size", "size of the spike", "CV unit"),
         Field("position_feedback", "predictions from the positions of the actuators", "", "flag", False),
-        Field("disturbance.time", "time of the pressure step", "s", low=0),
-        Field("disturbance.offset", "step of the reservoir pressure", "bar"),
-        Field("reference", "reference", "", "text", "thesis", tuple(references.NAMED), True),
+    ]
+    if process.disturbances:
+        unit = units.pop() if len(units) == 1 else "unit of the disturbance"
+        label = process.disturbances[0].label if len(process.disturbances) == 1 else "disturbance"
+        out += [
+            Field("disturbance.time", f"time of the step of the {label}", "s", low=0),
+            Field("disturbance.offset", f"step of the {label}", unit),
+        ]
+    if process.courses:
+        out.append(Field("course", "named disturbances", "", "text", None, tuple(process.courses)))
+    references = tuple(process.references)
+    return [
+        *out,
+        Field("reference", "reference", "", "text", process.default_reference, references, True),
         Field("duration", "length of the run", "s", low=0, shape=True),
     ]
-    return {field.key: field for field in out}
 
 
-FIELDS = _table()
-
-
-def find(path: str, key: Any, *given: Any) -> Field:
+def find(fields: Mapping[str, Field], path: str, key: Any, *given: Any) -> Field:
     """The field of a key, or an `InputError` at `path` that names similar keys and shows what is given, else the key."""
-    if key not in FIELDS:
-        # a last name that exists elsewhere, such as deadzone.gas_rate without tuning
-        alike = [known for known in FIELDS if known.endswith("." + str(key).rpartition(".")[2])][:3]
-        hint = near(key, FIELDS) or (f"Did you mean {' or '.join(alike)}?" if alike else "")
+    if key not in fields:
+        # a last name that exists elsewhere, such as deadzone.NAME without tuning
+        alike = [known for known in fields if known.endswith("." + str(key).rpartition(".")[2])][:3]
+        hint = near(key, fields) or (f"Did you mean {' or '.join(alike)}?" if alike else "")
         raise InputError(path, (*given, key)[0], "a key of docs/studies.md", hint)
-    return FIELDS[key]
+    return fields[key]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 
-from jaxmpc.loop.reference import Reference
+from jaxmpc.process.reference import Reference
 
 # start [s], gas rate [m3/h], oil rate [m3/h]
 THESIS_WINDOWS = (

@@ -16,7 +16,7 @@ from msgspec import UNSET
 
 from jaxmpc.errors import InputError
 from jaxmpc.loop.noise import check_deviation, check_seed
-from jaxmpc.loop.reference import Reference
+from jaxmpc.process.reference import Reference
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.problem.tuning import LIMIT_PAIRS

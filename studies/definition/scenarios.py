@@ -16,7 +16,7 @@ from msgspec import UnsetType
 
 from jaxmpc import html
 from jaxmpc.controller.measurement import SensorFault, fault_errors
-from jaxmpc.loop.reference import Reference
+from jaxmpc.process.reference import Reference
 from jaxmpc.loop.trajectory import AXES
 from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure

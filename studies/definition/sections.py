@@ -8,7 +8,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from jaxmpc.controller.measurement import FAULTS
-from jaxmpc.loop.reference import Reference
+from jaxmpc.process.reference import Reference
 from jaxmpc.loop.trajectory import AXES
 from jaxmpc.process.well.equations import CV_NAMES
 from studies.definition.refusing import located, require
@@ -150,7 +150,7 @@ class FaultSection(Section, frozen=True):
 
 
 class ReferenceDefinition(Section, frozen=True):
-    """``[base.reference]`` and the setpoints of a comparison; see `jaxmpc.loop.reference.Reference`."""
+    """``[base.reference]`` and the setpoints of a comparison; see `jaxmpc.process.reference.Reference`."""
 
     times: tuple[float, ...]  # change times [s]
     setpoints: tuple[tuple[float, ...], ...]  # one row per change, in CV order [CV unit]

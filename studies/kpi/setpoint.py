@@ -2,7 +2,7 @@
 
 Pure `jax.numpy` on fixed shapes like `studies.kpi.loop`, whose notation it shares; nothing here depends on how many
 windows a run has, so runs with different references are lanes of one `jax.vmap`. A *setpoint window* is a
-stretch of samples with equal labels (`jaxmpc.loop.reference.Reference.window`); setpoints are constant in it.
+stretch of samples with equal labels (`jaxmpc.process.reference.Reference.window`); setpoints are constant in it.
 """
 
 from __future__ import annotations

@@ -322,7 +322,7 @@ def batch_kpis(batch: TrajectoryBatch, tunings: Tuning, window, *, tolerance=Non
             sample is where the run began.
         tunings: one per lane of the batch (`jaxmpc.problem.tuning.stack_tunings`), or one for all.
         window: labels of the setpoint windows, ``"sample"`` or ``"lane sample"``, such as
-            `jaxmpc.loop.reference.Reference.window` gives.
+            `jaxmpc.process.reference.Reference.window` gives.
         tolerance: half width around the setpoint in which a CV counts as settled, ``"cv"`` or ``"lane cv"``
             [CV unit]; the deadzone of each lane if not given. Give one where scenarios differ in their deadzone.
 

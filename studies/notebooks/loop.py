@@ -20,7 +20,7 @@ import xarray as xr
 from figures.closed_loop import RUN, of_trajectory
 from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
-from jaxmpc.loop.reference import Reference
+from jaxmpc.process.reference import Reference
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.trajectory import RECORDABLE, Trajectory, TrajectoryBatch
 from jaxmpc.model.step_response import StepResponseModel

@@ -20,7 +20,7 @@ from identify.step_test import identify_step_response
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.targets import TargetController
 from jaxmpc.files import write_atomically
-from jaxmpc.loop.reference import Reference
+from jaxmpc.process.reference import Reference
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.targets import simulate_with_targets
 from jaxmpc.loop.trajectory import Trajectory

@@ -9,7 +9,7 @@ import pytest
 from jaxmpc import status
 from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.errors import InputError
-from jaxmpc.loop.reference import Reference
+from jaxmpc.process.reference import Reference
 from jaxmpc.loop.simulate import simulate, simulate_batch
 from jaxmpc.problem.tuning import make_tuning
 from jaxmpc.process.well.plant import WellPlant

@@ -13,7 +13,7 @@ from jaxmpc.controller.measurement import SensorFault, fault_errors
 from jaxmpc.controller.plan import Planner, solve_plan
 from jaxmpc.controller.targets import TargetController, augment
 from jaxmpc.errors import InputError
-from jaxmpc.loop.reference import Reference
+from jaxmpc.process.reference import Reference
 from jaxmpc.loop.targets import simulate_with_targets
 from jaxmpc.model.step_response import make_model
 from jaxmpc.problem.blocking import sample_moves

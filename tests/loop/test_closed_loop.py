@@ -17,7 +17,7 @@ from jaxmpc.controller.measurement import MISSING, OUTSIDE, SensorFault, fault_e
 from jaxmpc.errors import InputError
 from jaxmpc.loop.compiled import _Run
 from jaxmpc.loop.noise import noise_samples
-from jaxmpc.loop.reference import Reference
+from jaxmpc.process.reference import Reference
 from jaxmpc.loop.simulate import simulate, simulate_batch, simulate_batches
 from jaxmpc.process.host import HostPlant
 from jaxmpc.process.well.equations import WellParameters

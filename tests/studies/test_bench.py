@@ -13,7 +13,7 @@ from jaxmpc.cli.options import parser as make_parser
 from jaxmpc.controller.case import case_to_dict, make_case
 from jaxmpc.controller.plan import Planner
 from jaxmpc.errors import InputError
-from jaxmpc.loop.reference import Reference
+from jaxmpc.process.reference import Reference
 from studies.bench import forms, instances, peers, rows, run
 from studies.bench.context import Context, Size
 from studies.bench.instances import Recordings, replay

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxmpc.errors import InputError
-from jaxmpc.loop.reference import Reference
+from jaxmpc.process.reference import Reference
 from studies.definition import presets, references
 from studies.definition.comparison import ControllerDefinition, ReferenceDefinition
 from studies.kpi import evaluate

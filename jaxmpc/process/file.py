@@ -1,0 +1,383 @@
+"""The TOML file of a process: read strictly, every error with the path of the field; and the library of shipped ones.
+
+`load_process` is how studies, figures and the app get theirs; `jaxmpc.process.new` writes a first file from a model.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import tomllib
+from collections.abc import Mapping
+from importlib import resources, util
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+
+from jaxmpc.check import as_floats, is_number
+from jaxmpc.decoding import decode
+from jaxmpc.errors import InputError, near
+from jaxmpc.process.actuator import Actuator
+from jaxmpc.process.process import Cv, KeyFigure, ModelSource, Mv, PlantSource, Process, Variable
+from jaxmpc.process.reference import Reference
+
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+Numbers = dict[str, float]
+
+
+class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A table of the file."""
+
+
+class VariableSection(Section, frozen=True):
+    """``[[disturbance]]``, and what CVs and MVs have of it."""
+
+    name: str
+    unit: str = "1"
+    label: str = ""  # the name in words, if not given
+    span: Positive = 1.0
+
+
+class CvSection(VariableSection, frozen=True):
+    """``[[cv]]``; see `jaxmpc.process.process.Cv`."""
+
+    low: float = -np.inf
+    high: float = np.inf
+    settled: float = 0.0  # a fiftieth of the span, if not given
+
+
+class ActuatorSection(Section, frozen=True):
+    """``actuator = {...}`` of an MV; see `jaxmpc.process.actuator.Actuator`."""
+
+    kind: Literal["continuous", "stepped", "values", "on-off"]
+    step: Positive | None = None
+    threshold: Positive | None = None
+    origin: float = 0.0
+    values: tuple[float, ...] = ()
+
+
+class MvSection(VariableSection, frozen=True):
+    """``[[mv]]``; see `jaxmpc.process.process.Mv`."""
+
+    low: float = -np.inf
+    high: float = np.inf
+    move: Positive = np.inf
+    smallest_move: float | None = None  # a thousandth of the span, if not given
+    actuator: ActuatorSection = ActuatorSection("continuous")
+
+
+class PlantSection(Section, frozen=True):
+    """``[plants.NAME]``; see `jaxmpc.process.process.PlantSource`."""
+
+    kind: Literal["model", "jax", "fmu", "python"]
+    source: str = ""
+    options: dict[str, Any] = {}
+
+
+class ModelSection(Section, frozen=True):
+    """``[model]``; see `jaxmpc.process.process.ModelSource`."""
+
+    file: str = ""
+    working_point: Numbers = {}
+    steps: Numbers = {}
+    samples: Annotated[int, msgspec.Meta(ge=1)] = 250
+
+
+class WindowsSection(Section, frozen=True):
+    """``[references.NAME]`` and ``[disturbances.NAME]``: rows of start [s] and one value per CV or disturbance."""
+
+    windows: tuple[tuple[float, ...], ...]
+    duration: Positive | None = None  # of a reference [s]
+
+
+class KeyFigureSection(Section, frozen=True):
+    """``[[key_figure]]``; see `jaxmpc.process.process.KeyFigure`."""
+
+    name: str
+    integral_of: str
+    unit: str
+    label: str = ""
+    per: Positive = 1.0
+
+
+class ProcessFile(Section, frozen=True):
+    """The whole file."""
+
+    name: str
+    dt: Positive
+    cv: Annotated[tuple[CvSection, ...], msgspec.Meta(min_length=1)]
+    mv: Annotated[tuple[MvSection, ...], msgspec.Meta(min_length=1)]
+    presets: dict[str, dict[str, Any]]
+    references: dict[str, WindowsSection]
+    title: str = ""
+    source: str = ""
+    disturbance: tuple[VariableSection, ...] = ()
+    plants: dict[str, PlantSection] = {"model": PlantSection("model")}
+    model: ModelSection = ModelSection()
+    structure: dict[str, Any] = {}
+    disturbances: dict[str, WindowsSection] = {}
+    key_figure: tuple[KeyFigureSection, ...] = ()
+
+
+def shipped_processes() -> dict[str, Path]:
+    """Files of the processes that come with the package, by name."""
+    folder = Path(str(resources.files("jaxmpc.process"))) / "library"
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def load_process(name_or_path: str | Path, folder: str | Path = ".") -> Process:
+    """A shipped process by name, or any file by its path.
+
+    Args:
+        folder: that a path is relative to.
+
+    Raises:
+        InputError: for an unknown name, a file that cannot be read, and what `process_of` refuses.
+    """
+    shipped = shipped_processes()
+    path = shipped.get(str(name_or_path)) or Path(folder) / name_or_path
+    try:
+        body = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        expected = f"a process file, or one of {', '.join(shipped)} ({error.strerror or error})"
+        raise InputError("process", str(name_or_path), expected, near(name_or_path, shipped)) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError("process", str(path), f"a TOML file ({error})") from None
+    return process_of(body, path.parent)
+
+
+def process_of(body: Any, folder: str | Path = ".") -> Process:
+    """The process of a file's content; everything that can be wrong in it is found here.
+
+    Args:
+        folder: that files named in it are relative to.
+
+    Raises:
+        InputError: with the path of the field.
+    """
+    file = decode(body, ProcessFile, name="process file", expected=_expected)
+    _require(NAME.fullmatch(file.name), "name", file.name, "a letter, then up to 63 letters, digits, '-' and '_'")
+    _check_names(file)
+    _require(file.presets, "presets", {}, "one tuning or more, each headed [presets.NAME]")
+    _require(file.references, "references", {}, "one reference or more, each headed [references.NAME]")
+    _require(file.plants, "plants", {}, "one plant or more, each headed [plants.NAME]")
+    cvs = tuple(_cv(f"cv[{i}]", section) for i, section in enumerate(file.cv))
+    mvs = tuple(_mv(f"mv[{i}]", section) for i, section in enumerate(file.mv))
+    process = Process(
+        name=file.name,
+        title=file.title or file.name.replace("-", " "),
+        source=file.source,
+        dt=file.dt,
+        cvs=cvs,
+        mvs=mvs,
+        disturbances=tuple(Variable(s.name, s.unit, _label(s), s.span) for s in file.disturbance),
+        plants={name: PlantSource(s.kind, s.source, dict(s.options)) for name, s in file.plants.items()},
+        model=ModelSource(file.model.file, file.model.working_point, file.model.steps, file.model.samples),
+        structure_fields=_structure_fields(file.structure),
+        presets={name: _preset(file.presets, name) for name in file.presets},
+        references={name: _reference(name, section, cvs) for name, section in file.references.items()},
+        courses={name: _course(name, s, len(file.disturbance)) for name, s in file.disturbances.items()},
+        key_figures=tuple(
+            KeyFigure(s.name, _label(s), s.unit, s.integral_of, s.per) for s in file.key_figure
+        ),
+        folder=str(folder),
+        body=body,
+    )
+    _check_plants(process)
+    _check_controllers(process)
+    return process
+
+
+def process_digest(process: Process) -> str:
+    """Digest of a process and of the files that it names, so that results know what they were made of."""
+    found = hashlib.sha256(json.dumps(process.body, sort_keys=True, default=str).encode())
+    for source in (process.model.file, *(plant.source for plant in process.plants.values())):
+        path = Path(process.folder) / source if source else None
+        if path is not None and path.is_file():
+            found.update(path.read_bytes())
+        elif ":" in source:
+            module = util.find_spec(source.partition(":")[0])
+            if module is not None and module.origin:
+                found.update(Path(module.origin).read_bytes())
+    return found.hexdigest()[:16]
+
+
+# -------------------------------------------------------------------------------------------------------- sections
+
+
+def _require(met: object, path: str, value: object, expected: str, hint: str = "") -> None:
+    if not met:
+        raise InputError(path, value, expected, hint)
+
+
+def _expected(path: str, words: str) -> str:
+    """What a field takes, with its unit."""
+    unit = {
+        "dt": "s",
+        "duration": "s",
+        "span": "unit of the variable",
+        "low": "unit of the variable",
+        "high": "unit of the variable",
+        "settled": "CV unit",
+        "move": "MV unit per sample",
+        "smallest_move": "MV unit",
+        "step": "MV unit",
+        "threshold": "MV unit",
+        "per": "s",
+        "samples": "samples",
+    }.get(path.rpartition(".")[2])
+    return f"{words} [{unit}]" if unit else words
+
+
+def _check_names(file: ProcessFile) -> None:
+    """Refuse names that are no identifiers, or that two things have."""
+    seen: dict[str, str] = {}
+    for table in ("cv", "mv", "disturbance", "key_figure"):
+        for i, section in enumerate(getattr(file, table)):
+            path, expected = f"{table}[{i}].name", "letters, digits and '_', a letter first"
+            named = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,63}", section.name)
+            _require(named, path, section.name, expected)
+            _require(section.name not in seen, path, section.name, f"a name of its own ({seen.get(section.name)} has it)")
+            seen[section.name] = path
+    channels = [s.name for s in (*file.cv, *file.mv)]
+    for i, section in enumerate(file.key_figure):
+        expected = f"a CV or an MV: {', '.join(channels)}"
+        _require(section.integral_of in channels, f"key_figure[{i}].integral_of", section.integral_of, expected)
+    mvs = [s.name for s in file.mv]
+    for table in ("working_point", "steps"):
+        for name, value in getattr(file.model, table).items():
+            path = f"model.{table}.{name}"
+            _require(name in mvs, path, value, f"one of the MVs {', '.join(mvs)}", near(name, mvs))
+            good = is_number(value) and (table == "working_point" or value != 0)
+            _require(good, path, value, f"a finite number{'' if table == 'working_point' else ' other than 0'} [MV unit]")
+    for table in ("presets", "references", "plants", "disturbances"):
+        for name in getattr(file, table):
+            expected = "a letter, then up to 63 letters, digits, '-' and '_'"
+            _require(NAME.fullmatch(name), f"{table}.{name}", name, expected)
+
+
+def _label(section: Any) -> str:
+    return section.label or section.name.replace("_", " ")
+
+
+def _check_limits(path: str, section: Any) -> None:
+    unit = f"[{section.unit}]"
+    for field in ("low", "high"):
+        _require(not np.isnan(getattr(section, field)), f"{path}.{field}", getattr(section, field), f"a number {unit}")
+    _require(section.low < section.high, f"{path}.low", section.low, f"less than high = {section.high:g} {unit}")
+
+
+def _cv(path: str, section: CvSection) -> Cv:
+    _check_limits(path, section)
+    settled = section.settled or section.span / 50
+    _require(settled > 0 and is_number(settled), f"{path}.settled", settled, f"a half width above 0 [{section.unit}]")
+    return Cv(section.name, section.unit, _label(section), section.span, section.low, section.high, settled)
+
+
+def _mv(path: str, section: MvSection) -> Mv:
+    _check_limits(path, section)
+    smallest = section.span / 1000 if section.smallest_move is None else section.smallest_move
+    expected = f"0 or more [{section.unit}]"
+    _require(is_number(smallest) and smallest >= 0, f"{path}.smallest_move", smallest, expected)
+    return Mv(
+        section.name,
+        section.unit,
+        _label(section),
+        section.span,
+        _actuator(f"{path}.actuator", section),
+        section.low,
+        section.high,
+        section.move,
+        smallest,
+    )
+
+
+def _actuator(path: str, section: MvSection) -> Actuator:
+    given = section.actuator
+    fields = {name: getattr(given, name) for name in ("step", "threshold", "values")}
+    fields = {name: value for name, value in fields.items() if value not in (None, ())}
+    try:
+        return Actuator(given.kind, low=section.low, high=section.high, origin=given.origin, **fields)
+    except InputError as error:
+        field = error.field.removeprefix("actuator").lstrip(".")
+        raise InputError(f"{path}.{field}".rstrip("."), error.value, error.expected, error.hint) from None
+
+
+def _structure_fields(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Lists as tuples; the values are checked where structures are built."""
+    names = {"cv_names", "mv_names", "dt", "cv_units", "mv_units", "integer_step", "integer_values"}
+    for key, value in given.items():
+        _require(key not in names, f"structure.{key}", value, "nothing: it follows from [[cv]] and [[mv]]")
+    frozen = lambda v: tuple(map(frozen, v)) if isinstance(v, list) else v  # noqa: E731
+    return {key: frozen(value) for key, value in given.items()}
+
+
+def _preset(presets: Mapping[str, Mapping[str, Any]], name: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Fields of a preset on those of its base."""
+    own = dict(presets[name])
+    base = own.pop("base", None)
+    if base is None:
+        return own
+    path, known = f"presets.{name}.base", [other for other in presets if other not in (*seen, name)]
+    _require(base in known, path, base, f"another preset that is not made of this one: {', '.join(known)}")
+    return {**_preset(presets, base, (*seen, name)), **own}
+
+
+def _rows(path: str, section: WindowsSection, columns: int, what: str) -> np.ndarray:
+    for i, row in enumerate(section.windows):
+        expected = f"{columns + 1} numbers: start [s], then {what}"
+        _require(len(row) == columns + 1, f"{path}.windows[{i}]", list(row), expected)
+    return as_floats(f"{path}.windows", section.windows, "rows of numbers").reshape(-1, columns + 1)
+
+
+def _reference(name: str, section: WindowsSection, cvs: tuple[Cv, ...]) -> Reference:
+    path, listed = f"references.{name}", ", ".join(f"{cv.name} [{cv.unit}]" for cv in cvs)
+    rows = _rows(path, section, len(cvs), f"setpoints of {listed}")
+    _require(section.duration is not None, f"{path}.duration", None, "the length of the run [s]")
+    try:
+        return Reference(rows[:, 0], rows[:, 1:], section.duration)  # type: ignore[arg-type]
+    except InputError as error:
+        field = error.field.replace("reference", path, 1)
+        raise InputError(field, error.value, error.expected, error.hint) from None
+
+
+def _course(name: str, section: WindowsSection, disturbances: int) -> np.ndarray:
+    path = f"disturbances.{name}"
+    _require(disturbances, path, "windows", "nothing: there is no [[disturbance]]")
+    rows = _rows(path, section, disturbances, "one value per disturbance")
+    _require(section.duration is None, f"{path}.duration", section.duration, "nothing: the reference has the duration")
+    increasing = len(rows) and rows[0, 0] >= 0 and (np.diff(rows[:, 0]) > 0).all() and np.isfinite(rows).all()
+    _require(increasing, f"{path}.windows", rows[:, 0].tolist(), "finite rows at increasing times of 0 s or more")
+    return rows
+
+
+def _check_plants(process: Process) -> None:
+    for name, plant in process.plants.items():
+        path, kind = f"plants.{name}.source", plant.kind
+        if kind in ("jax", "python"):
+            _require(":" in plant.source, path, plant.source, "'module:name' of a function that makes the plant")
+        elif kind == "fmu" or plant.source:
+            found = (Path(process.folder) / plant.source).is_file() and plant.source
+            _require(found, path, plant.source, f"a file, relative to {process.folder}")
+        else:
+            _require(process.model.file, "model.file", "", f"a model file: plants.{name} is that model")
+    file = process.model.file
+    if file:
+        found = (Path(process.folder) / file).is_file()
+        _require(found, "model.file", file, f"a model file, relative to {process.folder}")
+
+
+def _check_controllers(process: Process) -> None:
+    """Build structures and tunings once, so that what is wrong in them is found here."""
+    for integer in (False, True) if process.stepped else (False,):
+        structure = process.structure(integer=integer)
+        for name in process.presets:
+            try:
+                process.tuning(structure, name)
+            except InputError as error:
+                field = error.field.replace("tuning", f"presets.{name}", 1)
+                raise InputError(field, error.value, error.expected, error.hint) from None
