@@ -26,7 +26,7 @@ from identify.fmu_process import TIME_LIMIT, FmuProcess
 from identify.fmu_source import MODEL_IDENTIFIER, fmu_files
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.files import write_atomically
-from jaxmpc.process.actuator import check_actuator, move_choke
+from jaxmpc.process.well.choke import CHOKES, check_choke
 from jaxmpc.process.well.equations import (
     DEFAULT_CHOKE,
     DEFAULT_LIFT,
@@ -175,7 +175,7 @@ class FmuPlant:
 
     Args:
         path: of the FMU; by default the shipped well, built on first use (FMI 2.0).
-        actuator: ``continuous`` or ``step``, see `jaxmpc.process.actuator`.
+        actuator: ``continuous`` or ``step``, see `jaxmpc.process.well.choke`.
         dt: sampling interval [s].
         time_limit: for one call of the FMU [s].
 
@@ -197,7 +197,7 @@ class FmuPlant:
         dt: float = 10.0,
         time_limit: float = TIME_LIMIT,
     ):
-        self.actuator = check_actuator(actuator, "plant.actuator")
+        self.actuator = check_choke(actuator, "plant.actuator")
         if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not 0 < dt < np.inf:
             raise InputError("plant.dt", dt, "a positive number of seconds")
         self.dt = float(dt)
@@ -289,7 +289,7 @@ class FmuPlant:
         offset = float(np.asarray(disturbance, dtype=np.float64).reshape(()))
         if not np.isfinite(offset):
             raise InputError("reservoir_pressure_offset", offset, "a finite pressure change [bar]")
-        self._position = float(move_choke(self.actuator, self._position, demand[0]))
+        self._position = float(CHOKES[self.actuator].move(self._position, demand[0]))
         self._lift = max(float(demand[1]), 0.0)
         inputs = _floats(INPUT_NAMES, (self._position, self._lift, offset))
         return self._measured(self._fmu.step(self.dt, inputs, OUTPUT_NAMES))

@@ -21,8 +21,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxmpc.check import as_floats, is_number
 from jaxmpc.errors import InputError
-from jaxmpc.process.actuator import check_actuator, move_choke
 from jaxmpc.process.plant import JaxPlant
+from jaxmpc.process.well.choke import CHOKES, LIFT, check_choke
 from jaxmpc.process.well.equations import (
     DEFAULT_CHOKE,
     DEFAULT_LIFT,
@@ -222,7 +222,7 @@ class WellPlant(JaxPlant):
                 raise InputError(f"plant.{name}", value, "a positive number of seconds")
         if abs(self.dt / self.substep - self.steps) > 1e-9 or self.steps < 1:
             raise InputError("plant.dt", self.dt, f"a whole number of substeps of {self.substep} s")
-        check_actuator(self.actuator, "plant.actuator")
+        check_choke(self.actuator, "plant.actuator")
         if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(self.parameters)):
             check_parameters(self.parameters, "plant.parameters")
 
@@ -262,8 +262,8 @@ class WellPlant(JaxPlant):
             ``(state, outputs)`` at the end of the sample. Not a number in gives not a number out.
         """
         mv = jnp.asarray(mv, dtype=jnp.float64)
-        position = jnp.asarray(move_choke(self.actuator, state.position, mv[0]))
-        lift = jnp.maximum(mv[1], 0.0)
+        position = CHOKES[self.actuator].move(state.position, mv[0])
+        lift = LIFT.move(state.lift, mv[1])
         offset = jnp.asarray(disturbance, dtype=jnp.float64).reshape(())
         u = (position, lift, offset)
         x = jnp.stack(runge_kutta(tuple(state.x), u, self.parameters, self.steps, self.substep))
