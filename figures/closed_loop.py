@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from figures import panels, style
 from jaxmpc.loop.trajectory import Trajectory
-from studies.definition.presets import CHOKE
+from studies.thesis.well import CHOKE
 
 RUN = "run"  # name of the one controller in results of one run
 PINNED: dict[str, Any] = {"color": "#9A9A9A", "linewidth": 1.8, "label": "pinned", "zorder": 1.5}

@@ -24,7 +24,7 @@ from jaxmpc.errors import InputError
 from studies.kpi.evaluate import completed, key_figures
 from studies.store.files import RESULTS
 from studies.store.reading import open_results
-from studies.thesis.plans import plan_at
+from studies.plans import plan_at
 
 X, Y = "travel", "deviation"  # columns of `points`, [%] and [1]
 TITLES = {X: "choke travel [%]", Y: "mean deviation / thesis deadzone [1]"}

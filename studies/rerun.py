@@ -6,16 +6,16 @@ import dataclasses
 import warnings
 from pathlib import Path
 
-import jax
 import numpy as np
 import xarray as xr
 
+from identify.plants import open_plant
 from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
 from jaxmpc.files import from_strict_json, write_atomically
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.trajectory import AXES, Trajectory
-from jaxmpc.process.well.plant import WellPlant
+from jaxmpc.process.process import Process
 from studies.definition.models import identify_models
 from studies.definition.scenarios import Study
 from studies.definition.sweep import StudyDefinition
@@ -33,7 +33,8 @@ class Rerun:
         deadzone: ``"cv"``, of its tuning [CV unit].
         title: study, number and the values of its axes.
         kind: of its controller.
-        actuator: of its choke.
+        actuator: of its MVs, ``step`` or ``continuous``.
+        process: that it controls.
     """
 
     trajectory: Trajectory
@@ -41,6 +42,7 @@ class Rerun:
     title: str
     kind: str
     actuator: str
+    process: Process
 
     def save(self, folder: Path) -> Path:
         """Write the trajectory as netCDF; returns the file."""
@@ -100,11 +102,13 @@ def rerun(store: Path, number: int) -> Rerun:
         warnings.warn(
             f"scenario {number} was stored by other code or inputs; it may differ now", stacklevel=2
         )
-    model = identify_models([scenario.model_point])[scenario.model_point]
-    parameters = jax.tree.map(np.float64, scenario.plant)  # arrays: no program of its own for every scenario
+    process, plant = study.process, study.definition.study.plant
+    model = identify_models(process, [scenario.model_point])[scenario.model_point]
+    # arrays: no program of its own for every scenario
+    parameters = {name: np.float64(value) for name, value in scenario.plant.items()}
     trajectory = simulate(
         Controller(scenario.structure, scenario.tuning, model),
-        WellPlant(parameters=parameters, actuator=scenario.actuator),
+        open_plant(process, plant, actual=scenario.actuator == "step", parameters=parameters),
         scenario.reference,
         samples=scenario.samples,
         disturbance=scenario.disturbance,
@@ -119,4 +123,6 @@ def rerun(store: Path, number: int) -> Rerun:
         for c in study.columns
     ]
     title = f"{study.name}, scenario {number}: {', '.join(values)}"
-    return Rerun(trajectory, np.asarray(scenario.tuning.deadzone), title, scenario.kind, scenario.actuator)
+    return Rerun(
+        trajectory, np.asarray(scenario.tuning.deadzone), title, scenario.kind, scenario.actuator, process
+    )

@@ -17,7 +17,7 @@ import xarray as xr
 from figures import style
 from jaxmpc.errors import InputError
 from studies.definition.fields import FIELDS, as_text
-from studies.definition.presets import TUNINGS
+from studies.thesis.well import TUNINGS
 from studies.store.layout import FLAG
 from studies.store.reading import open_study, provenance
 

@@ -18,7 +18,7 @@ from figures import panels, style
 from figures.sweep import sheet
 from figures.sweep.data import SweepAxis, Variant, quantities, variants
 from figures.sweep.wear import SPREAD
-from studies.definition.presets import CHOKE
+from studies.thesis.well import CHOKE
 
 FEWEST = 8  # scenarios of a variant, for a distribution
 MOST = 4  # variants in one figure

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from figures import panels, style
 from figures.figure import FigureEntry
-from studies.definition.presets import GAS, OIL
+from studies.thesis.well import GAS, OIL
 
 MARKERS = ("o", "s", "^")
 WORKING_CHOKE = 50.0  # %, where the model is identified

@@ -13,7 +13,7 @@ from figures.figure import FigureEntry
 from figures.thesis import runs
 from figures.thesis.facts import between, settled
 from jaxmpc.errors import InputError
-from studies.definition.presets import CHOKE, GAS, LIFT, OIL
+from studies.thesis.well import CHOKE, GAS, LIFT, OIL
 from studies.store.reading import provenance
 
 INTEGER = "mixed-integer"

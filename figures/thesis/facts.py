@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from studies.definition.presets import CHOKE
+from studies.thesis.well import CHOKE
 from studies.kpi import loop as kpi
 
 LATE = 600.0  # s at the end of a stretch that stand for what it settles at

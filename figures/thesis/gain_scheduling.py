@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from figures import panels, style
 from figures.figure import FigureEntry
-from studies.definition.presets import CHOKE, GAS, OIL
+from studies.thesis.well import CHOKE, GAS, OIL
 from studies.kpi.evaluate import key_figures
 
 NEAR_CLOSED = 6500.0  # m3/h, gas setpoints below it need a choke of less than about 12 %

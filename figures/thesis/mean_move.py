@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from figures import panels, style
 from figures.figure import FigureEntry
-from studies.definition.presets import CHOKE
+from studies.thesis.well import CHOKE
 from studies.kpi import loop as kpi
 from studies.kpi.evaluate import key_figures
 

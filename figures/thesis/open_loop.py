@@ -9,7 +9,7 @@ from figures import panels, style
 from figures.figure import FigureEntry
 from figures.thesis.facts import settled
 from figures.thesis.plans import first_change
-from studies.definition.presets import CHOKE, GAS, LIFT, OIL
+from studies.thesis.well import CHOKE, GAS, LIFT, OIL
 
 CLOSED, OPEN = "closed-loop", "open-loop"
 CURVES = {CLOSED: {"label": "closed loop"}, OPEN: {"label": "open loop", "color": style.PLAN}}

@@ -1,6 +1,6 @@
 """Thesis figures 25, 26 (a plan, and what came of it) and 36 to 38 (prediction against response in an oscillation).
 
-The past is white and what lies ahead grey. Plans come from `studies.thesis.plans`, which rebuilds them from what is stored;
+The past is white and what lies ahead grey. Plans come from `studies.plans`, which rebuilds them from what is stored;
 `draw_plan` is also what the app (`figures.explore`) shows of a plan.
 """
 
@@ -16,9 +16,9 @@ from figures import panels, style
 from figures.figure import FigureEntry
 from figures.thesis.facts import between, turns
 from jaxmpc.errors import InputError
-from studies.definition.presets import CHOKE, GAS, LIFT, OIL
-from studies.kpi.evaluate import NEAR_CLOSED
-from studies.thesis.plans import StoredPlan, plan_at
+from studies.thesis.well import CHOKE, GAS, LIFT, OIL
+from studies.thesis.reach import NEAR_CLOSED
+from studies.plans import StoredPlan, plan_at
 
 BEFORE = 600.0  # s of the past to show
 MINUTE = 60.0

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from figures import panels, style
 from jaxmpc.errors import InputError
-from studies.definition.presets import CHOKE, GAS, LIFT, OIL
+from studies.thesis.well import CHOKE, GAS, LIFT, OIL
 from studies.store.reading import open_results, provenance
 
 PLAIN, TARGETED = "without-rto", "with-rto"

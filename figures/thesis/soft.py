@@ -10,7 +10,7 @@ from figures import panels, style
 from figures.figure import FigureEntry
 from figures.thesis.facts import reversals, times
 from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS
-from studies.definition.presets import CHOKE, GAS, OIL, TUNINGS
+from studies.thesis.well import CHOKE, GAS, OIL, TUNINGS
 
 NOMINAL, SOFT = "nominal", "soft"
 PENALTIES = (  # preset, label, line

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from figures import style
 from figures.figure import FigureEntry
 from jaxmpc.status import LIMIT
-from studies.definition.presets import OIL
+from studies.thesis.well import OIL
 from studies.kpi.evaluate import key_figures
 
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from figures import panels, style
 from figures.figure import FigureEntry
 from figures.thesis.solve_time import MILLISECONDS, time_note, two_digits
-from studies.definition.presets import CHOKE, OIL
+from studies.thesis.well import CHOKE, OIL
 
 BLOCKS, SINGLE = "blocks", "no-blocks"
 TIMED: dict[str, dict[str, Any]] = {

@@ -83,12 +83,17 @@ class Actuator:
             count = xp.clip(xp.floor((demand - self.origin) / self.step + 0.5), *self._steps)
             nearest = self.origin + self.step * count
             return xp.where(away >= threshold - TOLERANCE * self.step, nearest, position)
-        values = self.values or (self.low, self.high)
+        values: Any = self.listed
         nearest = values[0]
         for value in values[1:]:
             nearest = xp.where(xp.abs(demand - value) < xp.abs(demand - nearest), value, nearest)
         nearer = xp.abs(demand - nearest) < away - TOLERANCE * min(np.diff(values))
         return xp.where(nearer, nearest, position)
+
+    @property
+    def listed(self) -> tuple[float, ...] | None:
+        """The values at which one of kind ``values`` or ``on-off`` can stand [MV unit]; None for the others."""
+        return (self.low, self.high) if self.kind == "on-off" else self.values or None
 
     @property
     def _steps(self) -> tuple[float, float]:

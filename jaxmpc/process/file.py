@@ -150,17 +150,20 @@ def load_process(name_or_path: str | Path, folder: str | Path = ".") -> Process:
     return process_of(body, path.parent)
 
 
-def process_of(body: Any, folder: str | Path = ".") -> Process:
+def process_of(body: Any, folder: str | Path = ".", *, files: bool = True) -> Process:
     """The process of a file's content; everything that can be wrong in it is found here.
 
     Args:
         folder: that files named in it are relative to.
+        files: whether they have to be there.
 
     Raises:
         InputError: with the path of the field.
     """
     file = decode(body, ProcessFile, name="process file", expected=_expected)
-    _require(NAME.fullmatch(file.name), "name", file.name, "a letter, then up to 63 letters, digits, '-' and '_'")
+    _require(
+        NAME.fullmatch(file.name), "name", file.name, "a letter, then up to 63 letters, digits, '-' and '_'"
+    )
     _check_names(file)
     _require(file.presets, "presets", {}, "one tuning or more, each headed [presets.NAME]")
     _require(file.references, "references", {}, "one reference or more, each headed [references.NAME]")
@@ -179,7 +182,10 @@ def process_of(body: Any, folder: str | Path = ".") -> Process:
         model=ModelSource(file.model.file, file.model.working_point, file.model.steps, file.model.samples),
         structure_fields=_structure_fields(file.structure),
         presets={name: _preset(file.presets, name) for name in file.presets},
-        references={name: _reference(name, section, cvs) for name, section in file.references.items()},
+        references={
+            name: windows_reference(f"references.{name}", section.windows, section.duration, cvs)
+            for name, section in file.references.items()
+        },
         courses={name: _course(name, s, len(file.disturbance)) for name, s in file.disturbances.items()},
         key_figures=tuple(
             KeyFigure(s.name, _label(s), s.unit, s.integral_of, s.per) for s in file.key_figure
@@ -187,7 +193,8 @@ def process_of(body: Any, folder: str | Path = ".") -> Process:
         folder=str(folder),
         body=body,
     )
-    _check_plants(process)
+    if files:
+        _check_plants(process)
     _check_controllers(process)
     return process
 
@@ -241,19 +248,31 @@ def _check_names(file: ProcessFile) -> None:
             path, expected = f"{table}[{i}].name", "letters, digits and '_', a letter first"
             named = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,63}", section.name)
             _require(named, path, section.name, expected)
-            _require(section.name not in seen, path, section.name, f"a name of its own ({seen.get(section.name)} has it)")
+            _require(
+                section.name not in seen,
+                path,
+                section.name,
+                f"a name of its own ({seen.get(section.name)} has it)",
+            )
             seen[section.name] = path
     channels = [s.name for s in (*file.cv, *file.mv)]
     for i, section in enumerate(file.key_figure):
         expected = f"a CV or an MV: {', '.join(channels)}"
-        _require(section.integral_of in channels, f"key_figure[{i}].integral_of", section.integral_of, expected)
+        _require(
+            section.integral_of in channels, f"key_figure[{i}].integral_of", section.integral_of, expected
+        )
     mvs = [s.name for s in file.mv]
     for table in ("working_point", "steps"):
         for name, value in getattr(file.model, table).items():
             path = f"model.{table}.{name}"
             _require(name in mvs, path, value, f"one of the MVs {', '.join(mvs)}", near(name, mvs))
             good = is_number(value) and (table == "working_point" or value != 0)
-            _require(good, path, value, f"a finite number{'' if table == 'working_point' else ' other than 0'} [MV unit]")
+            _require(
+                good,
+                path,
+                value,
+                f"a finite number{'' if table == 'working_point' else ' other than 0'} [MV unit]",
+            )
     for table in ("presets", "references", "plants", "disturbances"):
         for name in getattr(file, table):
             expected = "a letter, then up to 63 letters, digits, '-' and '_'"
@@ -267,14 +286,26 @@ def _label(section: Any) -> str:
 def _check_limits(path: str, section: Any) -> None:
     unit = f"[{section.unit}]"
     for field in ("low", "high"):
-        _require(not np.isnan(getattr(section, field)), f"{path}.{field}", getattr(section, field), f"a number {unit}")
-    _require(section.low < section.high, f"{path}.low", section.low, f"less than high = {section.high:g} {unit}")
+        _require(
+            not np.isnan(getattr(section, field)),
+            f"{path}.{field}",
+            getattr(section, field),
+            f"a number {unit}",
+        )
+    _require(
+        section.low < section.high, f"{path}.low", section.low, f"less than high = {section.high:g} {unit}"
+    )
 
 
 def _cv(path: str, section: CvSection) -> Cv:
     _check_limits(path, section)
     settled = section.settled or section.span / 50
-    _require(settled > 0 and is_number(settled), f"{path}.settled", settled, f"a half width above 0 [{section.unit}]")
+    _require(
+        settled > 0 and is_number(settled),
+        f"{path}.settled",
+        settled,
+        f"a half width above 0 [{section.unit}]",
+    )
     return Cv(section.name, section.unit, _label(section), section.span, section.low, section.high, settled)
 
 
@@ -316,7 +347,9 @@ def _structure_fields(given: Mapping[str, Any]) -> dict[str, Any]:
     return {key: frozen(value) for key, value in given.items()}
 
 
-def _preset(presets: Mapping[str, Mapping[str, Any]], name: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
+def _preset(
+    presets: Mapping[str, Mapping[str, Any]], name: str, seen: tuple[str, ...] = ()
+) -> dict[str, Any]:
     """Fields of a preset on those of its base."""
     own = dict(presets[name])
     base = own.pop("base", None)
@@ -327,31 +360,49 @@ def _preset(presets: Mapping[str, Mapping[str, Any]], name: str, seen: tuple[str
     return {**_preset(presets, base, (*seen, name)), **own}
 
 
-def _rows(path: str, section: WindowsSection, columns: int, what: str) -> np.ndarray:
-    for i, row in enumerate(section.windows):
-        expected = f"{columns + 1} numbers: start [s], then {what}"
-        _require(len(row) == columns + 1, f"{path}.windows[{i}]", list(row), expected)
-    return as_floats(f"{path}.windows", section.windows, "rows of numbers").reshape(-1, columns + 1)
+def _rows(path: str, given: Any, columns: int, what: str) -> np.ndarray:
+    expected = f"rows of {columns + 1} numbers: start [s], then {what}"
+    _require(isinstance(given, (list, tuple)) and given, path, given, expected)
+    for i, row in enumerate(given):
+        good = isinstance(row, (list, tuple)) and len(row) == columns + 1
+        _require(good, f"{path}[{i}]", row, expected)
+    return as_floats(path, given, expected)
 
 
-def _reference(name: str, section: WindowsSection, cvs: tuple[Cv, ...]) -> Reference:
-    path, listed = f"references.{name}", ", ".join(f"{cv.name} [{cv.unit}]" for cv in cvs)
-    rows = _rows(path, section, len(cvs), f"setpoints of {listed}")
-    _require(section.duration is not None, f"{path}.duration", None, "the length of the run [s]")
+def windows_reference(path: str, windows: Any, duration: Any, cvs: tuple[Cv, ...]) -> Reference:
+    """Setpoints from rows of start [s] and one value per CV, which hold until the next, and the length of the run [s].
+
+    Args:
+        path: of the table that has them, for errors.
+
+    Raises:
+        InputError: naming the row or the field.
+    """
+    at = f"{path}." if path else ""
+    listed = ", ".join(f"{cv.name} [{cv.unit}]" for cv in cvs)
+    rows = _rows(f"{at}windows", windows, len(cvs), f"setpoints of {listed}")
+    _require(duration is not None, f"{at}duration", None, "the length of the run [s]")
     try:
-        return Reference(rows[:, 0], rows[:, 1:], section.duration)  # type: ignore[arg-type]
+        return Reference(rows[:, 0], rows[:, 1:], duration)
     except InputError as error:
-        field = error.field.replace("reference", path, 1)
+        field = error.field.replace("reference.", at, 1)
         raise InputError(field, error.value, error.expected, error.hint) from None
 
 
 def _course(name: str, section: WindowsSection, disturbances: int) -> np.ndarray:
     path = f"disturbances.{name}"
     _require(disturbances, path, "windows", "nothing: there is no [[disturbance]]")
-    rows = _rows(path, section, disturbances, "one value per disturbance")
-    _require(section.duration is None, f"{path}.duration", section.duration, "nothing: the reference has the duration")
+    rows = _rows(f"{path}.windows", section.windows, disturbances, "one value per disturbance")
+    _require(
+        section.duration is None,
+        f"{path}.duration",
+        section.duration,
+        "nothing: the reference has the duration",
+    )
     increasing = len(rows) and rows[0, 0] >= 0 and (np.diff(rows[:, 0]) > 0).all() and np.isfinite(rows).all()
-    _require(increasing, f"{path}.windows", rows[:, 0].tolist(), "finite rows at increasing times of 0 s or more")
+    _require(
+        increasing, f"{path}.windows", rows[:, 0].tolist(), "finite rows at increasing times of 0 s or more"
+    )
     return rows
 
 
@@ -359,7 +410,9 @@ def _check_plants(process: Process) -> None:
     for name, plant in process.plants.items():
         path, kind = f"plants.{name}.source", plant.kind
         if kind in ("jax", "python"):
-            _require(":" in plant.source, path, plant.source, "'module:name' of a function that makes the plant")
+            _require(
+                ":" in plant.source, path, plant.source, "'module:name' of a function that makes the plant"
+            )
         elif kind == "fmu" or plant.source:
             found = (Path(process.folder) / plant.source).is_file() and plant.source
             _require(found, path, plant.source, f"a file, relative to {process.folder}")

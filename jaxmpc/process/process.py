@@ -1,7 +1,7 @@
 """A process: what a study needs to know beyond the controller, in one typed object and one TOML file.
 
-CVs, MVs with their actuators and disturbances by name and unit, plants, the model, the default structure, presets of tunings,
-references, disturbances over time and key figures. Study keys and their documentation, key figures, figures, reports and the
+CVs, MVs with their actuators and disturbances by name and unit, plants, the model, the default structure, presets of
+tunings, references, disturbances over time and key figures. Study keys and their documentation, key figures, figures, reports and the
 app follow from it. `jaxmpc.process.file` reads and writes the TOML; `jaxmpc.process.library` has the shipped processes.
 """
 
@@ -51,7 +51,7 @@ class Cv(Variable):
 class Mv(Variable):
     """A manipulated variable."""
 
-    actuator: Actuator = Actuator()  # what it does with a demand
+    actuator: Actuator = dataclasses.field(default_factory=Actuator)  # what it does with a demand
     low: float = -np.inf  # limits, for presets that do not give their own [MV unit]
     high: float = np.inf
     move: float = np.inf  # largest move per sample, likewise [MV unit]
@@ -78,7 +78,9 @@ class ModelSource:
     """Where the step-response model comes from: a file, or a step test on the plant."""
 
     file: str = ""
-    working_point: dict[str, float] = dataclasses.field(default_factory=dict)  # of the step test, by MV [MV unit]
+    working_point: dict[str, float] = dataclasses.field(
+        default_factory=dict
+    )  # of the step test, by MV [MV unit]
     steps: dict[str, float] = dataclasses.field(default_factory=dict)  # sizes of its steps, by MV [MV unit]
     samples: int = 250  # coefficients
 
@@ -174,7 +176,7 @@ class Process:
 
     def actuators(self, actual: bool = True) -> tuple[Actuator, ...]:
         """Of the MVs; where they are not the actual ones, they take every value between the same limits."""
-        return tuple(mv.actuator if actual else mv.actuator.continuous() for mv in self.mvs)
+        return tuple(mv.actuator if actual else Actuator(low=mv.low, high=mv.high) for mv in self.mvs)
 
     def structure(self, blocking: str = "moves", *, integer: bool = False, **changes: Any) -> Structure:
         """The default structure.
@@ -193,7 +195,7 @@ class Process:
         given |= {"blocks": ()} if blocking == "none" else {"blocking": blocking}
         if integer:
             steps = [mv.actuator.step if mv.actuator.kind == "stepped" else None for mv in self.mvs]
-            lists = [mv.actuator.values or None for mv in self.mvs]
+            lists = [mv.actuator.listed for mv in self.mvs]
             given["integer_step"] = tuple(steps)
             given["integer_values"] = tuple(lists) if any(lists) else ()
         else:
@@ -215,7 +217,9 @@ class Process:
         """
         preset = self.default_preset if preset is None else preset
         if preset not in self.presets:
-            raise InputError("tuning", preset, f"one of the presets {', '.join(self.presets)}", near(preset, self.presets))
+            raise InputError(
+                "tuning", preset, f"one of the presets {', '.join(self.presets)}", near(preset, self.presets)
+            )
         own: Fields = {}
         for key, field, variables in (
             ("cv_low", "low", self.cvs),
@@ -226,10 +230,15 @@ class Process:
         ):
             own[key] = {v.name: _or_none(getattr(v, field)) for v in variables}
         own["move_low"] = {mv.name: _or_none(-mv.move) for mv in self.mvs}
-        given = {key: dict(value) if isinstance(value, dict) else value for key, value in self.presets[preset].items()}
+        given = {
+            key: dict(value) if isinstance(value, dict) else value
+            for key, value in self.presets[preset].items()
+        }
         return own | given | (changes or {})
 
-    def tuning(self, structure: Structure, preset: str | None = None, changes: Fields | None = None) -> Tuning:
+    def tuning(
+        self, structure: Structure, preset: str | None = None, changes: Fields | None = None
+    ) -> Tuning:
         """A preset for a structure; oscillation rows (6.16) hold for MVs that are integer in it.
 
         Args:
@@ -251,7 +260,9 @@ class Process:
         """
         name = self.default_reference if name is None else name
         if name not in self.references:
-            raise InputError("reference", name, f"one of {', '.join(self.references)}", near(name, self.references))
+            raise InputError(
+                "reference", name, f"one of {', '.join(self.references)}", near(name, self.references)
+            )
         return self.references[name]
 
     def _complete(self, key: str, value: Any) -> Any:

@@ -76,6 +76,18 @@ class Reference:
         starts = np.flatnonzero(changed)
         return cls(starts * float(dt), setpoints[starts], len(setpoints) * float(dt))
 
+    def cut(self, duration: float) -> Reference:
+        """The first `duration` [s] of it, at most all; changes that are not reached are left out.
+
+        Raises:
+            InputError: for a duration that is not positive, or longer than this.
+        """
+        if not is_number(duration) or not 0 < duration <= self.duration:
+            expected = f"more than 0 s and at most the reference's {self.duration:g} s"
+            raise InputError("duration", duration, expected)
+        kept = self.times < duration
+        return Reference(self.times[kept], self.setpoints[kept], float(duration))
+
     @property
     def cv_count(self) -> int:
         """Number of CVs."""

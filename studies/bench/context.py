@@ -7,11 +7,10 @@ import functools
 from collections.abc import Callable
 
 from identify.step_test import identify_step_response
-from jaxmpc.process.reference import Reference
 from jaxmpc.model.step_response import StepResponseModel
 from studies.bench.instances import MODES, Mode, Recordings
 from studies.bench.peers import Peer
-from studies.definition import references
+from studies.thesis.well import WELL
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +32,7 @@ class Size:
     variant_samples: int = 900
     together: int = 64  # mixed-integer closed loops advanced together
     together_samples: int = 1200
-    together_reference: Callable[[], Reference] = references.thesis
+    together_reference: str = "thesis"
     growth: tuple[tuple[str, tuple[int, ...]], ...] = (  # sizes, of the horizon [samples]
         ("horizon", (60, 125, 250, 500)),
         ("blocks", (4, 8, 16, 32)),
@@ -60,7 +59,7 @@ QUICK = Size(
     foreign=("woodberry", "vinante", "quadtank"),
     variant_samples=300,
     together_samples=120,
-    together_reference=references.quick,
+    together_reference="quick",
     growth=(("horizon", (60,)), ("blocks", (4,)), ("CVs", (4,)), ("MVs", (4,))),
     startup_modes=("moves",),
     sweep_chunks=1,
@@ -91,5 +90,5 @@ class Context:
     @functools.cached_property
     def recordings(self) -> Recordings:
         """The closed loops that the problems come from."""
-        reference = references.quick() if self.quick else references.thesis()
+        reference = WELL.reference("quick") if self.quick else WELL.reference("thesis")
         return Recordings(self.model, reference, self.size.run, self.say)

@@ -20,18 +20,18 @@ import numpy as np
 from jaxmpc.controller.case import Case, case_to_dict
 from jaxmpc.controller.controller import Controller
 from jaxmpc.files import write_atomically
-from jaxmpc.process.reference import Reference
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
 from jaxmpc.process.host import HostPlant
+from jaxmpc.process.reference import Reference
 from jaxmpc.process.well.equations import well_hash
 from jaxmpc.process.well.plant import WellPlant
 from jaxmpc.programs.cache import cache_folder, read_sealed, sealed
 from studies.bench.judge import taken
-from studies.definition import presets
 from studies.store.fingerprint import content_hash
+from studies.thesis.well import WELL
 
 Kind = Literal["continuous", "mixed-integer"]
 Mode = Literal["moves", "inputs"]
@@ -112,8 +112,8 @@ class Instances:
 
 def make_controller(kind: Kind, mode: Mode, model: StepResponseModel) -> Controller:
     """The controller of the thesis preset."""
-    structure = presets.structure(mode, integer=kind == "mixed-integer")
-    return Controller(structure, presets.tuning(structure), model)
+    structure = WELL.structure(mode, integer=kind == "mixed-integer")
+    return Controller(structure, WELL.tuning(structure), model)
 
 
 @dataclasses.dataclass

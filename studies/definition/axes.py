@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -102,7 +102,7 @@ def expand_axes(definition: StudyDefinition, *, confirmed: bool = False) -> Axis
         check_count(definition, len(entries[0]), confirmed)
         return AxisTable(tuple(entries), _combine(method, entries))
     require(axes, "axes", "nothing", "one axis or more, each headed [[axes]]")
-    heads = [_head(axis, place) for axis, place in zip(axes, places, strict=True)]
+    heads = [_head(axis, place, definition.fields) for axis, place in zip(axes, places, strict=True)]
     _refuse_repeats([(f"{head.place}.key", field.key) for head in heads for field in head.fields])
     drawn = [axis.distribution is not UNSET for axis in axes]
     if any(drawn) and not sampled:
@@ -174,7 +174,7 @@ def _combine(method: str, axes: list[Entries]) -> np.ndarray:
 
 
 def _refuse_repeats(keys: list[tuple[str, str]]) -> None:
-    """Refuse a key that two axes set, in either of the two ways of setting a well parameter."""
+    """Refuse a key that two axes set, in either of the two ways of setting a parameter of the plant."""
     seen: dict[str, str] = {}
     for place, key in keys:
         same = key.replace("plant_scale.", "plant.")
@@ -191,7 +191,7 @@ def _shown(given: Any) -> Any:
     return None if given is UNSET else given
 
 
-def _head(axis: Axis, place: str) -> Entries:
+def _head(axis: Axis, place: str, known: Mapping[str, Field]) -> Entries:
     """The axis without its entries: fields and labels, its unit checked."""
     linked = axis.keys is not UNSET
     expected = "a key, or keys for several that move together (one of the two)"
@@ -199,7 +199,7 @@ def _head(axis: Axis, place: str) -> Entries:
     keys: Any = axis.keys if linked else [axis.key]
     require(keys, f"{place}.keys", keys, "one key or more")
     fields = tuple(
-        find(f"{place}.keys[{i}]" if linked else f"{place}.key", key) for i, key in enumerate(keys)
+        find(known, f"{place}.keys[{i}]" if linked else f"{place}.key", key) for i, key in enumerate(keys)
     )
     texts = {}
     for name in ("unit", "label"):
@@ -317,7 +317,7 @@ def _listed(definition: StudyDefinition) -> Entries:
     name: Any = definition.sampling.file
     header, _ = read_rows(Path(definition.folder), name, "sampling.file")
     places = [f"sampling.file ({name}, column {i + 1})" for i in range(len(header))]
-    fields = tuple(find(place, key) for place, key in zip(places, header, strict=True))
+    fields = tuple(find(definition.fields, place, key) for place, key in zip(places, header, strict=True))
     _refuse_repeats(list(zip(places, header, strict=True)))
     values, paths = read_columns(Path(definition.folder), name, "sampling.file", fields, header)
     require(values[0], "sampling.file", name, "a header and one row or more")

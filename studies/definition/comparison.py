@@ -14,25 +14,22 @@ import numpy as np
 
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
-from studies.definition import presets
+from jaxmpc.process.process import Process
 from studies.definition.refusing import located, require
 from studies.definition.sections import ReferenceDefinition as ReferenceDefinition
 
-PlantKind = Literal["fmu", "jax"]
-PLANTS: tuple[PlantKind, ...] = ("fmu", "jax")
 
-
-def held_offsets(steps: np.ndarray, samples: int, dt: float) -> np.ndarray:
-    """Offsets ``"sample"`` that hold from one step to the next, 0 before the first.
+def held(rows: np.ndarray, samples: int, dt: float) -> np.ndarray:
+    """Values ``"sample value"`` that hold from one row to the next, 0 before the first.
 
     Args:
-        steps: ``"step 2"``, increasing times [s] and the offset from then on; a step counts from the first sample that
+        rows: ``"row 1+value"``, increasing times [s] and the values from then on; a row counts from the first sample that
             starts at its time or later.
         samples: of the run.
         dt: sampling interval [s].
     """
-    place = np.searchsorted(steps[:, 0], (np.arange(samples) + 1e-9) * dt, side="right")
-    return np.concatenate([[0.0], steps[:, 1]])[place]
+    place = np.searchsorted(rows[:, 0], (np.arange(samples) + 1e-9) * dt, side="right")
+    return np.concatenate([np.zeros((1, rows.shape[1] - 1)), rows[:, 1:]])[place]
 
 
 class TuningChange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -54,15 +51,16 @@ class ControllerDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
         name: short and unique, the coordinate of the results.
         label: for legends.
         kind: ``continuous`` or ``mixed-integer`` MPC.
-        actuator: ``continuous`` or ``step`` choke.
-        blocking: ``moves``, ``inputs`` or ``none``; see `studies.definition.presets.structure`.
-        tuning: name of a preset in `studies.definition.presets.TUNINGS`.
+        actuator: ``step`` if MVs move as their actuators do, ``continuous`` if they take every value.
+        blocking: ``moves``, ``inputs`` or ``none``; see `jaxmpc.process.process.Process.structure`.
+        tuning: name of a preset of the process; its first if not given.
         changes: fields of `jaxmpc.problem.tuning.Tuning` that replace those of the preset.
         then: later tunings, in order of time; the controller keeps its state.
         open_loop_from: the plan of this time [s] is carried out to its end, whatever the well does; never if None.
         time_limit: of one step [s], for a mixed-integer controller; None for none.
         mean_move_mode: ``reactive`` or ``predictive``; see `jaxmpc.problem.structure.Structure`.
         schedule: whether the model follows the MVs, see `jaxmpc.controller.schedule`.
+        position_feedback: whether it is told where the actuators stand, and predicts from there.
     """
 
     name: str
@@ -70,24 +68,25 @@ class ControllerDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     kind: Literal["continuous", "mixed-integer"]
     actuator: Literal["continuous", "step"]
     blocking: Literal["moves", "inputs", "none"] = "moves"
-    tuning: str = "thesis"
+    tuning: str = ""
     changes: dict[str, Any] = {}
     then: tuple[TuningChange, ...] = ()
     open_loop_from: float | None = None
     time_limit: float | None = None
     mean_move_mode: Literal["reactive", "predictive"] = "reactive"
     schedule: bool = False
+    position_feedback: bool = False
 
-    def structure(self) -> Structure:
+    def structure(self, process: Process) -> Structure:
         """The checked structure."""
-        shape = presets.structure(self.blocking, integer=self.kind == "mixed-integer")
-        return dataclasses.replace(shape, mean_move_mode=self.mean_move_mode)
+        whole = self.kind == "mixed-integer"
+        return process.structure(self.blocking, integer=whole, mean_move_mode=self.mean_move_mode)
 
-    def build_tuning(self) -> Tuning:
+    def build_tuning(self, process: Process) -> Tuning:
         """The checked tuning that the run starts with."""
-        return presets.tuning(self.structure(), self.tuning, self.changes)
+        return process.tuning(self.structure(process), self.tuning or None, self.changes)
 
-    def later_tunings(self) -> tuple[tuple[float, Tuning], ...]:
+    def later_tunings(self, process: Process) -> tuple[tuple[float, Tuning], ...]:
         """The checked tunings of `then`, with the times from which they hold [s].
 
         Raises:
@@ -97,27 +96,31 @@ class ControllerDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
         for i, change in enumerate(self.then):
             changes |= change.changes
             with located(lambda field, i=i: f"then[{i}].changes.{field.removeprefix('tuning.')}"):
-                out.append((change.at, presets.tuning(self.structure(), self.tuning, changes)))
+                tuning = process.tuning(self.structure(process), self.tuning or None, changes)
+                out.append((change.at, tuning))
         return tuple(out)
 
-    def resolved(self) -> dict[str, Any]:
+    def resolved(self, process: Process) -> dict[str, Any]:
         """Every number that this controller runs with, presets filled in."""
         out = {
             "kind": self.kind,
             "actuator": self.actuator,
-            "structure": dataclasses.asdict(self.structure()),
-            "tuning": _fields(self.build_tuning()),
+            "structure": dataclasses.asdict(self.structure(process)),
+            "tuning": _fields(self.build_tuning(process)),
         }
         if self.then:
-            out["then"] = [{"at": at, "tuning": _fields(tuning)} for at, tuning in self.later_tunings()]
+            out["then"] = [
+                {"at": at, "tuning": _fields(tuning)} for at, tuning in self.later_tunings(process)
+            ]
         for key in ("open_loop_from", "time_limit"):
             if getattr(self, key) is not None:
                 out[key] = getattr(self, key)
-        if self.schedule:
-            out["schedule"] = True
+        for key in ("schedule", "position_feedback"):
+            if getattr(self, key):
+                out[key] = True
         return out
 
-    def check(self, duration: float) -> None:
+    def check(self, process: Process, duration: float) -> None:
         """Build everything once.
 
         Args:
@@ -126,9 +129,11 @@ class ControllerDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
         Raises:
             InputError: naming the field, by its path in the controller.
         """
-        self.build_tuning()
-        self.later_tunings()
-        dt, before, earlier = self.structure().dt, 0.0, "the start"
+        expected = f"continuous: no MV of {process.name} moves in steps or among values"
+        require(self.kind == "continuous" or process.stepped, "kind", self.kind, expected)
+        self.build_tuning(process)
+        self.later_tunings(process)
+        dt, before, earlier = process.dt, 0.0, "the start"
         last = duration - dt
         for i, change in enumerate(self.then):
             expected = f"a time from {before + dt:g} s, a sample after {earlier}, to {last:g} s"
@@ -153,45 +158,49 @@ class ComparisonDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     Attributes:
         name: of the study.
         title: for reports.
-        plant: ``fmu`` or ``jax``.
+        process: a shipped process, or a process file.
+        plant: name of one of its plants.
         controllers: in the order of reports.
         reference: setpoints.
-        disturbance: times [s] and reservoir-pressure offsets [bar], each held until the next; none before the first.
+        disturbance: rows of time [s] and one value per disturbance of the process, each held until the next; none before
+            the first.
     """
 
     name: str
     title: str
-    plant: PlantKind
+    process: str
+    plant: str
     controllers: tuple[ControllerDefinition, ...]
     reference: ReferenceDefinition
-    disturbance: tuple[tuple[float, float], ...] = ()
+    disturbance: tuple[tuple[float, ...], ...] = ()
 
-    def offsets(self, dt: float) -> np.ndarray:
-        """Reservoir-pressure offset at every sample of `dt` [s], ``"sample"`` [bar]."""
-        steps = np.array(self.disturbance, dtype=float).reshape(-1, 2)
-        return held_offsets(steps, self.reference.build().samples(dt), dt)
+    def offsets(self, process: Process) -> np.ndarray:
+        """Disturbances at every sample, ``"sample disturbance"``."""
+        rows = np.array(self.disturbance, dtype=float).reshape(-1, 1 + len(process.disturbances))
+        return held(rows, self.reference.build(process).samples(process.dt), process.dt)
 
-    def check(self) -> None:
+    def check(self, process: Process) -> None:
         """Build everything once, so that bad values are refused before a run.
 
         Raises:
             InputError: naming the field.
         """
-        require(self.plant in PLANTS, "plant", self.plant, f"one of {', '.join(PLANTS)}")
+        require(self.plant in process.plants, "plant", self.plant, f"one of {', '.join(process.plants)}")
         names = [controller.name for controller in self.controllers]
         distinct = names and len(set(names)) == len(names)
         require(distinct, "controllers", names, "one or more controllers with distinct names")
-        reference = self.reference.build()
-        duration, dt = reference.duration, self.controllers[0].structure().dt
+        reference = self.reference.build(process)
+        duration, dt = reference.duration, process.dt
         for controller in self.controllers:
-            own, path = controller.structure().dt, f"controllers.{controller.name}"
+            path = f"controllers.{controller.name}"
             with located(lambda field, path=path: f"{path}.{field}"):
-                controller.check(duration)
-            require(own == dt, f"{path}.dt", own, f"{dt} s like the others")
+                controller.check(process, duration)
         require(reference.samples(dt) >= 1, "reference.duration", duration, f"at least one sample of {dt} s")
         last = -1.0
-        for i, (start, offset) in enumerate(self.disturbance):
+        for i, (start, *values) in enumerate(self.disturbance):
             increasing = max(last, 0.0) <= start < duration and start != last
             require(increasing, f"disturbance[{i}][0]", start, f"increasing times from 0 to {duration:g} s")
-            require(np.isfinite(offset), f"disturbance[{i}][1]", offset, "a finite pressure offset [bar]")
+            listed = ", ".join(f"{d.name} [{d.unit}]" for d in process.disturbances)
+            good = len(values) == len(process.disturbances) and np.isfinite(values).all()
+            require(good, f"disturbance[{i}]", values, f"finite values of {listed}")
             last = start

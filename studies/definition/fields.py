@@ -1,7 +1,7 @@
 """The keys of a sweep study: everything that `[base]` can set and an axis can vary, with unit, meaning and default.
 
-A key is the path of the setting below `[base]`, for example ``tuning.deadzone.NAME`` of a CV. `study_fields` makes the one table
-of them for a process: definitions are checked against it, axes take units and labels from it, `docs/studies.md` lists it.
+A key is the path of the setting below `[base]`, for example ``tuning.deadzone.NAME`` of a CV. `study_fields` makes the one
+table of them for a process: definitions are checked against it, axes take units and labels from it, docs list it.
 """
 
 from __future__ import annotations
@@ -241,7 +241,8 @@ def _plant_fields(parameters: Sequence[Parameter]) -> list[Field]:
 
 def _run_fields(process: Process) -> list[Field]:
     out = [
-        Field(f"noise.{cv.name}", f"noise of the {cv.label}", cv.unit, default=0.0, low=0) for cv in process.cvs
+        Field(f"noise.{cv.name}", f"noise of the {cv.label}", cv.unit, default=0.0, low=0)
+        for cv in process.cvs
     ]
     units = {disturbance.unit for disturbance in process.disturbances}
     out += [

@@ -1,48 +1,43 @@
-"""Step-response models of a sweep study: identified on the nominal well, each working point once."""
+"""Step-response models of a sweep study: each working point once, on the plant of the process with its own parameters."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from identify.step_test import identify_step_response
+from identify.plants import model_of, open_plant
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import StepResponseModel
-from jaxmpc.process.well.equations import WellParameters
-from jaxmpc.process.well.plant import check_inputs, steady_state_of
+from jaxmpc.process.process import Process
 from studies.definition.refusing import require
 
-Point = tuple[float, float]
-STEPS = (2.0, 100.0)  # of the choke [%] and of the gas lift [m3/h]
-SAMPLES = 250  # coefficients of a model
+Point = tuple[float, ...]  # a value per MV [MV unit]; empty where the model is a file
 
 
 def identify_models(
-    points: Iterable[Point], samples: int = SAMPLES, *, progress: Callable[[int, int], None] | None = None
+    process: Process, points: Iterable[Point], *, progress: Callable[[int, int], None] | None = None
 ) -> dict[Point, StepResponseModel]:
-    """Models of the shipped well by working point ``(choke [%], gas lift [m3/h])``, in the order of first appearance.
+    """Models of a process by working point, in the order of first appearance.
 
     Args:
-        samples: number of coefficients N.
         progress: called with ``(done, total)`` models.
 
     Raises:
-        InputError: naming the working point, for one outside its range (the step test goes 2 % and 100 m3/h further) or
-            without a steady state; before any model is identified.
+        InputError: naming the working point, for one outside its range (the step test goes a step further) or without a
+            steady state; before any model is identified.
     """
-    wanted = list(dict.fromkeys((float(choke), float(lift)) for choke, lift in points))
-    for choke, lift in wanted:
-        here = f"model.choke = {choke:g} %, model.lift = {lift:g} m3/h"
+    wanted = list(dict.fromkeys(tuple(map(float, point)) for point in points))
+    plant = None if process.model.file else open_plant(process, actual=False)
+    for point in wanted if plant is not None else ():
+        named = zip(process.mvs, point, strict=True)
+        here = ", ".join(f"model.{mv.name} = {value:g} {mv.unit}" for mv, value in named)
         try:
-            check_inputs(choke, lift)
-            check_inputs(choke + STEPS[0], lift + STEPS[1])
+            settles = plant.settles(point) if hasattr(plant, "settles") else True  # pyright: ignore[reportOptionalMemberAccess]
         except InputError as error:
-            expected = f"{error.expected}, also {STEPS[0]:g} % and {STEPS[1]:g} m3/h further"
-            raise InputError(here, error.value, expected) from None
-        settles = steady_state_of(choke, lift, 0.0, WellParameters()).converged
-        require(settles, here, "no steady state", "a working point at which the well settles")
+            raise InputError(here, error.value, error.expected, error.hint) from None
+        require(settles, here, "no steady state", "a working point at which the plant settles")
     out = {}
-    for choke, lift in wanted:
-        out[choke, lift] = identify_step_response(None, choke, lift, STEPS, samples)
+    for point in wanted:
+        out[point] = model_of(process, plant, point)
         if progress is not None:
             progress(len(out), len(wanted))
     return out

@@ -14,24 +14,18 @@ from typing import Any
 import numpy as np
 from msgspec import UNSET
 
+from identify.plants import open_plant
 from jaxmpc.errors import InputError
 from jaxmpc.loop.noise import check_deviation, check_seed
-from jaxmpc.process.reference import Reference
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.problem.tuning import LIMIT_PAIRS
-from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES, WellParameters, check_parameters
-from jaxmpc.process.well.plant import check_inputs
-from studies.definition import presets, references
+from jaxmpc.process.reference import Reference
 from studies.definition.axes import AxisTable
-from studies.definition.fields import FIELDS, PLANT_FIELDS, SHIPPED, plant_si
 from studies.definition.refusing import located, require
 from studies.definition.sections import ReferenceDefinition
 from studies.definition.sweep import StudyDefinition
 
-_NAMES_OF = {"cv": CV_NAMES, "mv": MV_NAMES, "": ("",)}
-NAMES = {key: _NAMES_OF[field.of] for key, field in TUNING.items() if not field.flag}
-SHAPE_KEYS = tuple(field.key for field in FIELDS.values() if field.shape)
 LONGEST_RUN = 1_000_000  # samples
 
 
@@ -40,7 +34,7 @@ class Variant:
     """What fixes shapes and setpoints, shared by all scenarios that agree in it."""
 
     kind: str  # continuous or mixed-integer
-    actuator: str  # continuous or step
+    actuator: str  # whether MVs move as their actuators do (step) or take every value (continuous)
     structure: Structure  # of the controller
     reference: Reference  # setpoints, cut to the length of the run
     samples: int  # length of the run [samples]
@@ -54,13 +48,17 @@ class Inputs:
     variant: np.ndarray  # "scenario", which of them
     # per field of `jaxmpc.problem.tuning.Tuning` "scenario name", and "scenario" for the bias cut-off
     tuning: dict[str, np.ndarray]
-    # per field of `jaxmpc.process.well.equations.WellParameters` "scenario", SI units
-    plant: dict[str, np.ndarray]
-    point: np.ndarray  # "scenario 2", working point of the model: choke [%], gas lift [m3/h]
+    plant: dict[str, np.ndarray]  # per parameter of the plant that is set "scenario", in the unit of its key
+    point: (
+        np.ndarray
+    )  # "scenario mv", working point of the model [MV unit]; no columns where the model is a file
     noise: np.ndarray  # "scenario cv", standard deviation [CV unit]
     seed: np.ndarray  # "scenario", of the noise
-    # "scenario step 2", steps of the reservoir pressure: time [s], offset from then on [bar]
-    pressure: np.ndarray
+    step_names: tuple[str, ...]  # disturbance of every step
+    steps: (
+        np.ndarray
+    )  # "scenario step 2", steps of disturbances: time [s], offset from then on [unit of the disturbance]
+    course: np.ndarray  # "scenario", named disturbances; empty text for none
     fault_kinds: tuple[tuple[str, str], ...]  # CV and kind of every sensor fault
     faults: np.ndarray  # "scenario fault 3", time [s], duration [s] and size [CV unit] of the sensor faults
     told: np.ndarray  # "scenario", whether the controller is told where the actuators stand
@@ -75,6 +73,7 @@ class Settings:
     """Base settings and axes of a definition: the value of a key in every scenario."""
 
     def __init__(self, definition: StudyDefinition, table: AxisTable):
+        self.definition, self.fields = definition, definition.fields
         self.base, self.table, self.count = definition.base, table, len(table)
 
     def given(self, key: str) -> bool:
@@ -85,19 +84,28 @@ class Settings:
         """In one scenario, plain and typed; the default where nothing is given."""
         found = self.table.column(key)
         if found is None:
-            return self.base.get(key, FIELDS[key].default)
+            return self.base.get(key, self.fields[key].default)
         return found[1][found[2][scenario]]
 
     def numbers(self, key: str, change: Callable[[float], float] | None = None) -> np.ndarray:
         """A numeric key ``"scenario"``, of length 1 if it does not vary; `change` converts each entry."""
         found = self.table.column(key)
-        values = [self.base.get(key, FIELDS[key].default)] if found is None else found[1]
+        values = [self.base.get(key, self.fields[key].default)] if found is None else found[1]
         out = np.array(values if change is None else [change(v) for v in values], dtype=np.float64)
         return out if found is None else out[found[2]]
 
     def columns(self, keys: Sequence[str]) -> np.ndarray:
         """Some numeric keys ``"scenario key"``."""
+        if not keys:
+            return np.zeros((1, 0))
         return np.stack(np.broadcast_arrays(*[self.numbers(key) for key in keys]), axis=1)
+
+    def texts(self, key: str) -> np.ndarray:
+        """A key of texts ``"scenario"``, of length 1 if it does not vary; empty where nothing is given."""
+        found = self.table.column(key)
+        values = [self.base.get(key)] if found is None else found[1]
+        out = np.array([value or "" for value in values], dtype=object)
+        return out if found is None else out[found[2]]
 
     def combinations(self, keys: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
         """First scenario of each distinct combination of some keys' values, and each scenario's combination."""
@@ -121,7 +129,7 @@ def resolve(definition: StudyDefinition, table: AxisTable) -> Inputs:
     Raises:
         InputError: naming the entries of the axes (or the base) whose combination is refused.
     """
-    settings = Settings(definition, table)
+    settings, process = Settings(definition, table), definition.process
     variants, variant = _variants(settings)
     kinds = np.array([v.kind == "mixed-integer" for v in variants])
     runs = np.array([v.reference.duration for v in variants])[variant], variants[0].structure.dt
@@ -130,16 +138,19 @@ def resolve(definition: StudyDefinition, table: AxisTable) -> Inputs:
         variant=variant,
         tuning=_tuning(settings, kinds[variant] if len(set(kinds)) > 1 else kinds[:1]),
         plant=_plant(settings),
-        point=settings.columns(("model.choke", "model.lift")),
-        noise=settings.columns([f"noise.{name}" for name in CV_NAMES]),
+        point=settings.columns([f"model.{name}" for name in process.mv_names if not process.model.file]),
+        noise=settings.columns([f"noise.{name}" for name in process.cv_names]),
         seed=settings.numbers("seed").astype(np.int64),
-        pressure=_events(settings, "disturbance", ("time", "offset"), *runs),
+        step_names=tuple(
+            s.name or process.disturbance_names[0] for s in settings.base.get("disturbance", ())
+        ),
+        steps=_events(settings, "disturbance", ("time", "offset"), *runs),
+        course=settings.texts("course"),
         fault_kinds=tuple((fault.cv, fault.kind) for fault in settings.base.get("sensor_fault", ())),
         faults=_events(settings, "sensor_fault", ("time", "duration", "size"), *runs),
         told=settings.numbers("position_feedback").astype(bool),
     )
-    check_inputs(inputs.point[:, 0], inputs.point[:, 1])
-    check_deviation(inputs.noise, len(CV_NAMES))
+    check_deviation(inputs.noise, len(process.cvs))
     check_seed(inputs.seed)
     return inputs
 
@@ -148,7 +159,7 @@ def resolve(definition: StudyDefinition, table: AxisTable) -> Inputs:
 
 
 def _variants(settings: Settings) -> tuple[tuple[Variant, ...], np.ndarray]:
-    firsts, index = settings.combinations(SHAPE_KEYS)
+    firsts, index = settings.combinations([key for key, field in settings.fields.items() if field.shape])
     cut: dict[tuple[Any, Any], Reference] = {}
     variants = []
     for k in firsts.tolist():
@@ -171,18 +182,23 @@ def _structure(settings: Settings, k: int) -> Structure:
     value = lambda key: settings.value(key, k)  # noqa: E731
     blocks, blocking = value("blocks"), value("blocking")
     horizon = value("control_horizon") or sum(blocks[0] if isinstance(blocks[0], tuple) else blocks)
-    base = presets.structure("moves", integer=value("controller") == "mixed-integer")
+    process = settings.definition.process
+    base = process.structure("moves", integer=value("controller") == "mixed-integer")
     own: dict[str, Any] = {}
     if base.integer_mvs:
-        lists = [value(f"integer_values.{name}") for name in MV_NAMES]
-        steps = [step if values is None else None for step, values in zip(base.steps, lists, strict=True)]
-        dwell = [value(f"dwell.{name}") for name in MV_NAMES]
+        given = [value(f"integer_values.{name}") for name in process.mv_names]
+        listed = base.integer_values or (None,) * len(given)
+        lists = [own or shipped for own, shipped in zip(given, listed, strict=True)]
+        steps = [
+            step if values is None else None for step, values in zip(base.integer_step, lists, strict=True)
+        ]
+        dwell = [value(f"dwell.{name}") for name in process.mv_names]
         own = dict(integer_step=tuple(steps), integer_values=tuple(lists), dwell=tuple(dwell))
     same = ("prediction_horizon", "first_penalised", "integer_horizon", "mean_move_window", "mean_move_mode")
 
     def place(field: str) -> str:
         name = field.removeprefix("structure.")
-        key = name if name in FIELDS else name.partition(".")[0]
+        key = name if name in settings.fields else name.partition(".")[0]
         partner = {"blocks": ["control_horizon"], "first_penalised": ["prediction_horizon"]}.get(key, [])
         return settings.table.blame([key, *filter(settings.given, partner)], k)
 
@@ -199,44 +215,47 @@ def _structure(settings: Settings, k: int) -> Structure:
 
 def _reference(settings: Settings, k: int, name: Any, duration: float | None) -> Reference:
     """A named or own reference, cut to a duration [s]; changes that the run would not reach are left out."""
-    whole = name.build("base.") if isinstance(name, ReferenceDefinition) else references.NAMED[name]()
+    process = settings.definition.process
+    whole = name.build(process, "base.") if isinstance(name, ReferenceDefinition) else process.reference(name)
     if duration is None or duration == whole.duration:
         return whole
-    expected = f"more than 0 s and at most the reference's {whole.duration:g} s"
-    require(0 < duration <= whole.duration, settings.table.blame(["duration"], k), duration, expected)
-    kept = whole.times < duration
-    return Reference(whole.times[kept], whole.setpoints[kept], float(duration))
+    with located(lambda _: settings.table.blame(["duration"], k)):
+        return whole.cut(duration)
 
 
 # --------------------------------------------------------------------------------------------------------- tuning
 
 
 def _tuning(settings: Settings, integer: np.ndarray) -> dict[str, np.ndarray]:
-    """Tuning fields "scenario name"; `integer` ("scenario" or one for all): whether the choke moves in whole steps."""
+    """Tuning fields "scenario name"; `integer` ("scenario" or one for all): whether MVs move in whole steps."""
+    process = settings.definition.process
     firsts, preset = settings.combinations(["preset"])
-    tables = [presets.tuning_fields(settings.value("preset", k)) for k in firsts.tolist()]
+    tables = [process.tuning_fields(settings.value("preset", k)) for k in firsts.tolist()]
     preset = preset if len(tables) > 1 else preset[:1]
+    names_of = {"cv": process.cv_names, "mv": process.mv_names, "": ("",)}
+    names = {key: names_of[field.of] for key, field in TUNING.items() if not field.flag}
     out = {}
-    for field, names in NAMES.items():
+    for field, own in names.items():
         columns = []
-        for name in names:
+        for name in own:
             key = f"tuning.{field}.{name}".rstrip(".")
             of_preset = np.array([_number(field, table, name) for table in tables])[preset]
             columns.append(settings.numbers(key) if settings.given(key) else of_preset)
-        out[field] = np.stack(np.broadcast_arrays(*columns), axis=1) if names[0] else columns[0]
+        out[field] = np.stack(np.broadcast_arrays(*columns), axis=1) if own[0] else columns[0]
     for low, high in LIMIT_PAIRS:
         smaller, larger = np.broadcast_arrays(out[low], out[high])
         wrong = (smaller > larger) | np.isposinf(smaller) | np.isneginf(larger)
         for k, i in np.argwhere(wrong)[:1].tolist():
-            name = NAMES[low][i]
+            name = names[low][i]
             keys = [f"tuning.{field}.{name}" for field in (low, high)]
             keys = [key for key in keys if settings.given(key)] or keys
             found = f"{low} {smaller[k, i]:g}, {high} {larger[k, i]:g}"
-            expected = f"{low} of {name} at most its {high} [{FIELDS[f'tuning.{low}.{name}'].unit}]"
+            expected = f"{low} of {name} at most its {high} [{settings.fields[f'tuning.{low}.{name}'].unit}]"
             raise InputError(settings.table.blame(keys, k), found, expected)
     rows = settings.numbers("tuning.oscillation_rows").astype(bool)
     rows, whole = np.broadcast_arrays(rows, integer)
-    out["oscillation_rows"] = np.stack([rows & whole, np.zeros_like(whole)], axis=1)
+    watched = np.array([[_watched(table, mv) for mv in process.mv_names] for table in tables])[preset]
+    out["oscillation_rows"] = watched & (rows & whole)[:, None]
     soft = settings.numbers("soft").astype(bool)[:, None]
     if not soft.all():  # as hard everywhere as the soft controller is far outside its deadzone, as in no-soft
         out["cv_weight"] = out["cv_weight"] + np.where(soft, 0.0, out["soft_quadratic"])
@@ -245,49 +264,60 @@ def _tuning(settings: Settings, integer: np.ndarray) -> dict[str, np.ndarray]:
     return out
 
 
+def _watched(preset: dict[str, Any], mv: str) -> bool:
+    """Whether a preset has oscillation rows for an MV."""
+    given = preset.get("oscillation_rows")
+    return bool(given.get(mv)) if isinstance(given, dict) else False
+
+
 def _number(field: str, preset: dict[str, Any], name: str) -> float:
     """A preset's value of a field, or what holds where it says nothing."""
     value = preset.get(field)
-    value = value[name] if isinstance(value, dict) else value
+    value = value.get(name) if isinstance(value, dict) else value
     return TUNING[field].default if value is None else value
 
 
-# ----------------------------------------------------------------------------------------------- well and pressure
+# ----------------------------------------------------------------------------------------- plant and disturbances
 
 
 def _plant(settings: Settings) -> dict[str, np.ndarray]:
-    """Well parameters "scenario" in SI units, all accepted by `check_parameters`."""
-    out = {}
-    for name in PLANT_FIELDS:
-        absolute, relative = f"plant.{name}", f"plant_scale.{name}"
-        if settings.given(absolute) and settings.given(relative):
-            expected = f"nothing: {absolute} is set as well; choose one"
-            raise InputError(settings.table.blame([relative], 0), settings.value(relative, 0), expected)
-        if settings.given(absolute):
-            out[name] = settings.numbers(absolute, lambda value, name=name: plant_si(name, value))
-        elif settings.given(relative):
-            out[name] = SHIPPED[name] * settings.numbers(relative)
-        else:
-            out[name] = np.array([SHIPPED[name]])
+    """Parameters of the plant that the study sets, "scenario", in the units of their keys, all accepted by the plant."""
+    process, name = settings.definition.process, settings.definition.study.plant
+    out: dict[str, np.ndarray] = {}
+    for key in settings.fields:
+        table, _, parameter = key.partition(".")
+        if table not in ("plant", "plant_scale") or not settings.given(key):
+            continue
+        other = f"plant_scale.{parameter}"
+        if table == "plant_scale" and parameter in out:
+            expected = f"nothing: plant.{parameter} is set as well; choose one"
+            raise InputError(settings.table.blame([other], 0), settings.value(other, 0), expected)
+        scale = settings.fields[f"plant.{parameter}"].default if table == "plant_scale" else 1.0
+        out[parameter] = scale * settings.numbers(key)
+    if not out:
+        return out
+    plant = open_plant(process, name)
     try:
-        check_parameters(WellParameters(**out))
+        plant.replaced(out)
     except InputError as error:
-        raise _located(settings, out, error) from None
+        raise _located(settings, plant, out, error) from None
+    finally:
+        if hasattr(plant, "close"):
+            plant.close()
     return out
 
 
-def _located(settings: Settings, plant: dict[str, np.ndarray], error: InputError) -> InputError:
-    """The error of the first scenario whose well is refused, with the entries that it comes from."""
+def _located(settings: Settings, plant: Any, given: dict[str, np.ndarray], error: InputError) -> InputError:
+    """The error of the first scenario whose plant is refused, with the entries that it comes from."""
     for k in range(settings.count):
         try:
-            check_parameters(WellParameters(**{n: float(row(values, k)) for n, values in plant.items()}))
+            plant.replaced({name: float(row(values, k)) for name, values in given.items()})
         except InputError as found:
-            name = found.field.removeprefix("well.")
-            names = [name, *["trip_end"] * found.expected.endswith("trip_end")]  # what it is compared with
+            name = found.field.rpartition("plant.")[2]
+            names = [name, *(other for other in given if other != name and other in found.expected)]
             keys = [f"{table}.{n}" for n in names for table in ("plant", "plant_scale")]
             keys = list(filter(settings.given, keys)) or [f"plant.{name}"]
-            expected = found.expected.replace(" (SI units)", "").replace(" [Pa]", "")
-            expected = f"{expected} [{FIELDS[keys[0]].unit}] for {keys[0]}"
+            expected = f"{found.expected} for {keys[0]}"
             return InputError(settings.table.blame(keys, k), settings.value(keys[0], k), expected)
     return error
 

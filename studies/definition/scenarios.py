@@ -14,17 +14,19 @@ from typing import Any, Literal
 import numpy as np
 from msgspec import UnsetType
 
+from identify.plants import model_samples
 from jaxmpc import html
 from jaxmpc.controller.measurement import SensorFault, fault_errors
-from jaxmpc.process.reference import Reference
 from jaxmpc.loop.trajectory import AXES
 from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning, make_tuning
-from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES, WellParameters
+from jaxmpc.process.file import process_digest
+from jaxmpc.process.process import Process
+from jaxmpc.process.reference import Reference
 from studies.definition import models
 from studies.definition.axes import AxisTable, expand_axes
-from studies.definition.comparison import held_offsets
+from studies.definition.comparison import held
 from studies.definition.estimate import MODEL_SECONDS, Description, Work, chunk_seconds
 from studies.definition.refusing import require
 from studies.definition.resolve import Inputs, Variant, resolve, row
@@ -44,14 +46,14 @@ class Scenario:
 
     Attributes:
         kind, tuning: of the controller.
-        actuator: of the choke.
+        actuator: ``step`` if MVs move as their actuators do, ``continuous`` if they take every value.
         structure: of the controller; the same object for all scenarios of a group that agree in it.
-        model_point: working point ``(choke [%], gas lift [m3/h])`` at which the model is identified, on the nominal well.
-        plant: parameters of the well that is controlled.
+        model_point: working point of the model, ``"mv"`` [MV unit], identified on the plant with its own parameters.
+        plant: parameters of the plant that is controlled, where they are not its own, in the units of their keys.
         reference: setpoints; the same object for scenarios with the same ones.
         noise: standard deviation ``"cv"`` [CV unit]; None without noise.
         seed: of the noise.
-        disturbance: offset of the reservoir pressure ``"sample"`` [bar]; None without any.
+        disturbance: ``"sample disturbance"``, in the order of the process; None without any.
         faults: errors of failing sensors ``"sample cv"`` (`jaxmpc.controller.measurement.fault_errors`); None without any.
         position_feedback: whether the controller is told where the actuators stand.
     """
@@ -61,8 +63,8 @@ class Scenario:
     actuator: Literal["continuous", "step"]
     structure: Structure
     tuning: Tuning
-    model_point: tuple[float, float]
-    plant: WellParameters
+    model_point: models.Point
+    plant: dict[str, float]
     reference: Reference
     samples: int
     noise: np.ndarray | None
@@ -92,13 +94,14 @@ class Group:
     samples: int
     has_limits: bool
     switching: bool
-    points: tuple[tuple[float, float], ...]
+    points: tuple[models.Point, ...]
     scenarios: np.ndarray
+    model_samples: int  # coefficients of the models
 
     @property
     def program(self) -> tuple[Any, ...]:
         """What it is compiled for, besides the number of lanes."""
-        size, whole = Size.of(self.structure, models.SAMPLES), bool(self.structure.integer_mvs)
+        size, whole = Size.of(self.structure, self.model_samples), bool(self.structure.integer_mvs)
         return size, whole, self.actuator, self.has_limits, self.switching, len(self.points) == 1
 
 
@@ -143,7 +146,12 @@ class Study:
         return self.definition.study.title or self.name
 
     @property
-    def model_points(self) -> tuple[tuple[float, float], ...]:
+    def process(self) -> Process:
+        """That is controlled."""
+        return self.definition.process
+
+    @property
+    def model_points(self) -> tuple[models.Point, ...]:
         """Distinct working points of all models, for `models.identify_models`."""
         return tuple(dict.fromkeys(point for group in self.groups for point in group.points))
 
@@ -159,7 +167,7 @@ class Study:
             structure=variant.structure,
             tuning=make_tuning(variant.structure, **fields),
             model_point=tuple(row(inputs.point, k).tolist()),
-            plant=WellParameters(**{name: float(row(values, k)) for name, values in inputs.plant.items()}),
+            plant={name: float(row(values, k)) for name, values in inputs.plant.items()},
             reference=variant.reference,
             samples=variant.samples,
             noise=noise.copy() if noise.any() else None,
@@ -175,6 +183,7 @@ class Study:
         inputs, noise = self._inputs, row(self._inputs.noise, k)
         return fingerprint.content_hash(
             self._code,
+            self._process,
             self._variant_hashes[inputs.variant[k]],
             {name: row(values, k).tolist() for name, values in inputs.tuning.items()},
             {name: float(row(values, k)) for name, values in inputs.plant.items()},
@@ -191,7 +200,7 @@ class Study:
         return tuple(self.scenario_hash(k) for k in range(self.count))
 
     def varying_plant(self, group: int) -> tuple[str, ...]:
-        """Parameters of the well that differ within a group, so that a compiled program takes them per lane."""
+        """Parameters of the plant that differ within a group, so that a compiled program takes them per lane."""
         members = self.groups[group].scenarios
         return tuple(
             name
@@ -223,7 +232,7 @@ class Study:
     def describe(self) -> Description:
         """What a run would do, for a dry run; prints as a short table."""
         store = self.definition.store
-        widths = {"": 1, "cv": len(CV_NAMES), "mv": len(MV_NAMES)}
+        widths = {"": 1, "cv": len(self.process.cvs), "mv": len(self.process.mvs)}
         kept = sum(widths[axis] * len(set(names) & set(store.trajectories)) for axis, names in AXES.items())
         points = math.ceil(max(group.samples for group in self.groups) / store.every)
         return Description(
@@ -248,11 +257,17 @@ class Study:
         return self._inputs.variants[self._inputs.variant[k]]
 
     def _disturbance(self, k: int) -> np.ndarray | None:
-        """Offsets "sample" [bar]."""
-        steps, variant = row(self._inputs.pressure, k), self._variant(k)
-        if not steps[:, 1].any():
+        """Disturbances "sample disturbance"."""
+        inputs, variant, process = self._inputs, self._variant(k), self.process
+        steps, course = row(inputs.steps, k), str(row(inputs.course, k))
+        if not steps[:, 1].any() and not course:
             return None
-        return held_offsets(steps, variant.samples, variant.structure.dt)
+        of = np.array(inputs.step_names)
+        run = variant.samples, process.dt
+        columns = [
+            held(steps[of == name] if len(of) else steps, *run)[:, 0] for name in process.disturbance_names
+        ]
+        return np.stack(columns, axis=1) + (held(process.courses[course], *run) if course else 0.0)
 
     def _faults(self, k: int) -> np.ndarray | None:
         """Errors of the sensors "sample cv" [CV unit]."""
@@ -262,6 +277,11 @@ class Study:
         numbers = row(inputs.faults, k).tolist()
         faults = [SensorFault(*kind, *its) for kind, its in zip(inputs.fault_kinds, numbers, strict=True)]  # type: ignore[arg-type]
         return fault_errors(variant.structure, variant.samples, faults, path="base.sensor_fault")
+
+    @functools.cached_property
+    def _process(self) -> list[str]:
+        study = self.definition.study
+        return [process_digest(self.process), study.plant]
 
     @functools.cached_property
     def _code(self) -> str:
@@ -281,18 +301,18 @@ def code_hash() -> str:
     """Of the code that turns the numbers of a scenario into results."""
     packages = [fingerprint.source_hash(package) for package in ("jaxmpc", "identify")]
     modules = [fingerprint.module_hash(f"studies.{name}") for name in COMPUTING]
-    return fingerprint.content_hash(packages, modules, models.STEPS, models.SAMPLES)
+    return fingerprint.content_hash(packages, modules)
 
 
 def expand_sweep(definition: StudyDefinition, *, confirmed: bool = False) -> Study:
     """Expand a definition without ``[search]``; see `studies.load.expand`.
 
-    What is guaranteed: every scenario has a structure, tuning, well, working point, reference and disturbance that the typed
-    objects accept, also in combination. What only a simulation shows, such as a well that does not settle, is not.
+    What is guaranteed: every scenario has a structure, tuning, plant, working point, reference and disturbance that the
+    typed objects accept, also in combination. What only a simulation shows, such as a plant that does not settle, is not.
     """
     table = expand_axes(definition, confirmed=confirmed)
     inputs = resolve(definition, table)
-    groups = _groups(inputs, len(table))
+    groups = _groups(inputs, len(table), model_samples(definition.process))
     given = definition.study.chunk_size
     wanted = default_chunk_size(len(table)) if isinstance(given, UnsetType) else given
     size = min(wanted, max(len(group.scenarios) for group in groups))
@@ -324,7 +344,7 @@ def _columns(table: AxisTable) -> tuple[Column, ...]:
     )
 
 
-def _groups(inputs: Inputs, count: int) -> tuple[Group, ...]:
+def _groups(inputs: Inputs, count: int, samples: int) -> tuple[Group, ...]:
     tuning = inputs.tuning
     limited = np.any(np.isfinite(tuning["cv_low"]) | np.isfinite(tuning["cv_high"]), axis=1)
     switching = np.any(np.isfinite(tuning["bad_limit"]), axis=1)
@@ -336,5 +356,5 @@ def _groups(inputs: Inputs, count: int) -> tuple[Group, ...]:
     groups = []
     for key, scenarios in members.items():
         points = dict.fromkeys(tuple(row(inputs.point, k).tolist()) for k in scenarios)
-        groups.append(Group(*key, tuple(points), np.array(scenarios)))
+        groups.append(Group(*key, tuple(points), np.array(scenarios), samples))
     return tuple(groups)

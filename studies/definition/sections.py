@@ -8,11 +8,12 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from jaxmpc.controller.measurement import FAULTS
-from jaxmpc.process.reference import Reference
 from jaxmpc.loop.trajectory import AXES
-from jaxmpc.process.well.equations import CV_NAMES
+from jaxmpc.process.process import Process
+from jaxmpc.process.reference import Reference
 from studies.definition.refusing import located, require
 
+DEFAULT_PROCESS = "gas-lifted-well"
 Count = Annotated[int, msgspec.Meta(ge=1)]
 STORABLE = tuple(name for names in AXES.values() for name in names if name != "time")
 
@@ -25,6 +26,8 @@ class StudySection(Section, frozen=True):
     """``[study]``."""
 
     name: str  # of the study and of its folder of results
+    process: str = DEFAULT_PROCESS  # a shipped process, or a process file relative to the definition
+    plant: str = ""  # one of its plants; the first if not given
     title: str = ""  # for reports
     # scenarios that are computed and stored together; if not given, `scenarios.default_chunk_size` of a
     # study, `search_study.BATCH` of a search
@@ -132,17 +135,18 @@ class StudyFile(Section, frozen=True):
     quick: Quick | None = None
 
 
-class PressureStep(Section, frozen=True):
-    """``[[base.disturbance]]``: the reservoir pressure is off by `offset` [bar] from `time` [s] on."""
+class DisturbanceStep(Section, frozen=True):
+    """``[[base.disturbance]]``: from `time` [s] on, a disturbance is off by `offset` [its unit]."""
 
     time: float
     offset: float
+    name: str = ""  # of the disturbance; not needed where there is one
 
 
 class FaultSection(Section, frozen=True):
     """``[[base.sensor_fault]]``: a sensor that fails for a while, as in `jaxmpc.controller.measurement.SensorFault`."""
 
-    cv: Literal[CV_NAMES]  # type: ignore[valid-type]
+    cv: str
     kind: Literal[FAULTS]  # type: ignore[valid-type]
     time: float
     duration: float | UnsetType = UNSET
@@ -162,10 +166,11 @@ class ReferenceDefinition(Section, frozen=True):
         setpoints = tuple(tuple(row) for row in reference.setpoints.tolist())
         return cls(tuple(reference.times.tolist()), setpoints, reference.duration)
 
-    def build(self, place: str = "") -> Reference:
+    def build(self, process: Process, place: str = "") -> Reference:
         """The checked reference; `place` is the path of the table that it stands in, for errors, such as ``base.``."""
         with located(lambda field: f"{place}{field}"):
             reference = Reference(self.times, self.setpoints, self.duration)
-        found, expected = f"{reference.cv_count} columns", f"one per CV: {', '.join(CV_NAMES)} [m3/h]"
-        require(reference.cv_count == len(CV_NAMES), f"{place}reference.setpoints", found, expected)
+        listed = ", ".join(f"{cv.name} [{cv.unit}]" for cv in process.cvs)
+        found, expected = f"{reference.cv_count} columns", f"one per CV: {listed}"
+        require(reference.cv_count == len(process.cvs), f"{place}reference.setpoints", found, expected)
         return reference

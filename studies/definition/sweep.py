@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import tomllib
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,18 +18,20 @@ import msgspec
 from msgspec import UNSET
 from msgspec.structs import replace
 
+from identify.plants import parameters_of
 from jaxmpc.controller.measurement import FAULTS
 from jaxmpc.decoding import decode
 from jaxmpc.errors import InputError, near
-from jaxmpc.process.well.equations import CV_NAMES
-from studies.definition.fields import FIELDS, find
+from jaxmpc.process.file import load_process
+from jaxmpc.process.process import Process
+from studies.definition.fields import Field, find, study_fields
 from studies.definition.refusing import require
 from studies.definition.sections import (
     STORABLE,
     Axis,
     Cut,
+    DisturbanceStep,
     FaultSection,
-    PressureStep,
     Quick,
     Range,
     ReferenceDefinition,
@@ -47,8 +50,10 @@ class StudyDefinition:
     """A sweep study as written, every section decoded."""
 
     study: StudySection
-    # settings by key (`fields.FIELDS`), only those that are given; besides, reference may be an
-    # `ReferenceDefinition`, disturbance is a tuple of `PressureStep` and sensor_fault one of `FaultSection`
+    process: Process
+    fields: Mapping[str, Field]  # the keys that base and axes may have
+    # settings by key (`fields`), only those that are given; besides, reference may be an
+    # `ReferenceDefinition`, disturbance is a tuple of `DisturbanceStep` and sensor_fault one of `FaultSection`
     base: dict[str, Any]
     axes: tuple[Axis, ...]
     sampling: Sampling
@@ -79,9 +84,12 @@ class StudyDefinition:
         require(named, "study.name", file.study.name, expected)
         if file.search is not None and "sampling" in body:
             raise InputError("sampling", body["sampling"], "no such table: [search] draws from the axes")
+        process, fields = process_fields(file.study, folder)
         out = cls(
             study=file.study,
-            base=settings(file.base, "base"),
+            process=process,
+            fields=fields,
+            base=settings(file.base, "base", process, fields),
             axes=file.axes,
             sampling=file.sampling,
             store=file.store,
@@ -142,7 +150,7 @@ class StudyDefinition:
         return dataclasses.replace(
             self,
             study=replace(study, name=f"{study.name}-quick"),
-            base={**self.base, **settings(quick.base, "quick.base")},
+            base={**self.base, **settings(quick.base, "quick.base", self.process, self.fields)},
             axes=tuple(axes),
             places=tuple(places),
             sampling=sampling,
@@ -207,7 +215,25 @@ def _check_plain(body: dict[str, Any]) -> None:
         raise InputError(level[0][0], "tables or lists", f"no more than {DEEPEST} of them within each other")
 
 
-def settings(body: Any, path: str) -> dict[str, Any]:
+def process_fields(study: StudySection, folder: str | Path) -> tuple[Process, dict[str, Field]]:
+    """The process of a study, and the keys that it may have.
+
+    Raises:
+        InputError: for a process or a plant that does not exist, or cannot be opened.
+    """
+    try:
+        process = load_process(study.process, folder)
+    except InputError as error:
+        if error.field == "process":
+            raise InputError("study.process", error.value, error.expected, error.hint) from None
+        raise
+    if study.plant and study.plant not in process.plants:
+        known = ", ".join(process.plants)
+        raise InputError("study.plant", study.plant, f"one of {known}", near(study.plant, process.plants))
+    return process, study_fields(process, parameters_of(process, study.plant))
+
+
+def settings(body: Any, path: str, process: Process, fields: Mapping[str, Field]) -> dict[str, Any]:
     """A base table as settings by key, each of its own type; `InputError` with the full path otherwise."""
     require(isinstance(body, dict), path, body, "a table of settings")
     out: dict[str, Any] = {}
@@ -216,14 +242,14 @@ def settings(body: Any, path: str) -> dict[str, Any]:
         for name, value in table.items():
             key = f"{prefix}{name}"
             where = f"{path}.{key}"
-            below = [known for known in FIELDS if known.startswith(key + ".")]
+            below = [known for known in fields if known.startswith(key + ".")]
             if key in _EVENTS:
-                out[key] = _events(value, key, where)
+                out[key] = _events(value, key, where, process, fields)
             elif key == "reference" and isinstance(value, dict):
                 out[key] = _convert(value, ReferenceDefinition, where)
-                out[key].build(f"{path}.")
-            elif key in FIELDS:
-                out[key] = FIELDS[key].check(where, value)
+                out[key].build(process, f"{path}.")
+            elif key in fields:
+                out[key] = fields[key].check(where, value)
             elif below and isinstance(value, dict):
                 walk(value, key + ".")
             elif below:
@@ -233,13 +259,15 @@ def settings(body: Any, path: str) -> dict[str, Any]:
                 if isinstance(value, dict) and value:  # name the whole key that was meant
                     inner = next(iter(value))
                     key, value, where = f"{key}.{inner}", value[inner], f"{where}.{inner}"
-                find(where, key, value)
+                find(fields, where, key, value)
 
     walk(body, "")
     return out
 
 
-def _events(value: Any, table: str, where: str) -> tuple[Any, ...]:
+def _events(
+    value: Any, table: str, where: str, process: Process, fields: Mapping[str, Field]
+) -> tuple[Any, ...]:
     """What ``[[base.disturbance]]`` or ``[[base.sensor_fault]]`` lists, each number checked by its key."""
     kind, what = _EVENTS[table]
     require(isinstance(value, list), where, value, f"{what}, each headed [[{where}]]")
@@ -247,16 +275,28 @@ def _events(value: Any, table: str, where: str) -> tuple[Any, ...]:
     for i, event in enumerate(events):
         for name in ("time", "offset", "duration", "size"):
             if (given := getattr(event, name, UNSET)) is not UNSET:
-                FIELDS[f"{table}.{name}"].check(f"{where}[{i}].{name}", given)
-        if table == "disturbance" and i:
-            before = events[i - 1].time
-            expected = f"a time after the step before it, {before:g} s"
-            require(event.time > before, f"{where}[{i}].time", event.time, expected)
+                fields[f"{table}.{name}"].check(f"{where}[{i}].{name}", given)
+        if table == "sensor_fault":
+            require(
+                event.cv in process.cv_names,
+                f"{where}[{i}].cv",
+                event.cv,
+                f"one of {', '.join(process.cv_names)}",
+            )
+            continue
+        names = process.disturbance_names
+        require(names, where, value, f"nothing: {process.name} has no disturbances")
+        known = event.name in names or (not event.name and len(names) == 1)
+        require(known, f"{where}[{i}].name", event.name, f"one of {', '.join(names)}")
+        earlier = [other.time for other in events[:i] if other.name == event.name]
+        if earlier:
+            expected = f"a time after the step before it, {earlier[-1]:g} s"
+            require(event.time > earlier[-1], f"{where}[{i}].time", event.time, expected)
     return events
 
 
 _EVENTS: dict[str, tuple[Any, str]] = {
-    "disturbance": (PressureStep, "steps of the reservoir pressure"),
+    "disturbance": (DisturbanceStep, "steps of disturbances"),
     "sensor_fault": (FaultSection, "faults of sensors"),
 }
 _EXPECTED = {
@@ -268,7 +308,7 @@ _EXPECTED = {
     "count": "a whole number of 1 or more [scenarios or values]",
     "sampling.seed": "a whole number of 0 or more",
     "batches": "a whole number of 1 or more [batches]",
-    "search.objectives": "a list of key figures, one or more, such as choke_travel or deviation",
+    "search.objectives": "a list of key figures, one or more, such as travel.NAME or deviation",
     "search.directions": "a list of 'minimize' and 'maximize', one per objective",
     "search.sampler": "one of nsga2, tpe",
     "search.seed": "a whole number of 0 or more",
@@ -279,12 +319,12 @@ _EXPECTED = {
     "kind": "one of uniform, log-uniform, normal",
     "keep": "a list of positions, the first is 0",
     "values": "a list of values",
-    "sensor_fault.cv": f"one of {', '.join(CV_NAMES)}",
+    "sensor_fault.cv": "the name of a CV",
     "sensor_fault.kind": f"one of {', '.join(FAULTS)}",
     "time": "a time [s]",
-    "offset": "a change of the reservoir pressure [bar]",
+    "offset": "a change of the disturbance [its unit]",
     "times": "a list of times [s]",
-    "setpoints": f"a list of rows, one number per CV ({', '.join(CV_NAMES)}) [m3/h]",
+    "setpoints": "a list of rows, one number per CV [CV unit]",
     "duration": "a length of the run [s]",
 }
 

@@ -4,8 +4,8 @@ Everything here is `jax.numpy` on fixed shapes, so `jax.vmap` turns it into the 
 of scenarios; plain numpy arrays go in just as well, and each figure is then one small program. Notation: y measured CV,
 r setpoint, u actuator position, k the sample, dt the sampling interval, m[k] = u[k] - u[k-1] the move at sample k.
 
-A *move* is an |m[k]| above a threshold. `MOVE_THRESHOLD` = 0.05 % keeps the creeping of a continuous choke
-out and every 2 % step in. A *reversal* is a move whose direction is opposite to the move before it.
+A *move* is an |m[k]| above a threshold, the smallest move of its MV: it keeps the creeping of a continuous actuator out and
+every step of a stepped one in. A *reversal* is a move whose direction is opposite to the move before it.
 """
 
 from __future__ import annotations
@@ -19,8 +19,6 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 import jaxmpc  # noqa: F401  (switches JAX to float64)
-
-MOVE_THRESHOLD = 0.05  # % choke
 
 Samples = Float[ArrayLike, " sample"]  # moves or positions of one MV, or a number per sample
 Labels = Int[ArrayLike, " sample"]
@@ -41,19 +39,19 @@ def moves_of(position: Samples, start) -> Float[Array, " sample"]:
 
 @functools.partial(jax.jit, inline=True)
 def travel(move: Samples) -> Number:
-    """Travel sum_k |m[k]|, in the unit of the move: the wear of a choke, in %."""
+    """Travel sum_k |m[k]|, in the unit of the move: the wear of an actuator."""
     return jnp.abs(jnp.asarray(move)).sum()
 
 
 @functools.partial(jax.jit, inline=True)
-def move_count(move: Samples, threshold: float = MOVE_THRESHOLD) -> Count:
+def move_count(move: Samples, threshold: float = 0.0) -> Count:
     """Number of samples with |m[k]| > threshold."""
     return (jnp.abs(jnp.asarray(move)) > threshold).sum()
 
 
 @functools.partial(jax.jit, inline=True)
 def reversal_events(
-    move: Samples, threshold: float = MOVE_THRESHOLD, segment: Labels | None = None
+    move: Samples, threshold: float = 0.0, segment: Labels | None = None
 ) -> Bool[Array, " sample"]:
     """Samples at which the MV turns round.
 
@@ -99,7 +97,7 @@ def second_halves(window: Int[np.ndarray, " sample"]) -> Int[np.ndarray, " sampl
 
 
 @functools.partial(jax.jit, inline=True)
-def dwell(move: Samples, dt: float, threshold: float = MOVE_THRESHOLD) -> tuple[Number, Number]:
+def dwell(move: Samples, dt: float, threshold: float = 0.0) -> tuple[Number, Number]:
     """Mean and shortest time between successive moves [s].
 
     With moves at k1 < ... < kn: mean (kn - k1) dt / (n - 1), shortest min_i (k(i+1) - k(i)) dt; NaN if n < 2.
@@ -160,9 +158,9 @@ def largest_excess(
 
 
 @functools.partial(jax.jit, inline=True)
-def volume(rate: Samples, dt: float) -> Number:
-    """Integral of a rate that is held from sample to sample, dt / 3600 sum_k q[k]: m3/h gives m3."""
-    return dt / 3600.0 * jnp.asarray(rate).sum()
+def integral(rate: Samples, dt: float, per: float = 1.0) -> Number:
+    """Integral of a rate that is held from sample to sample, dt / per sum_k q[k]: with per = 3600 s, m3/h gives m3."""
+    return dt / per * jnp.asarray(rate).sum()
 
 
 @functools.partial(jax.jit, inline=True)
@@ -199,22 +197,22 @@ def windowed_mean(move: Samples, samples: int) -> Float[Array, " sample"]:
 
 
 @functools.partial(jax.jit, static_argnames="samples", inline=True)
-def mean_move_stops(move: Samples, samples: int, limit: float, threshold: float = MOVE_THRESHOLD) -> Count:
-    """Steps of the staircase: how often opening pauses because the windowed mean is above its limit.
+def mean_move_stops(move: Samples, samples: int, limit: float, threshold: float = 0.0) -> Count:
+    """Steps of the staircase: how often a rise pauses because the windowed mean is above its limit.
 
-    Counts opening moves m[k] > threshold whose opening move before it, at j < k - 1, brought the windowed
-    mean above `limit`, with no closing move in between: opening went on after a pause.
+    Counts moves up m[k] > threshold whose move up before it, at j < k - 1, brought the windowed mean above `limit`, with no
+    move down in between: the rise went on after a pause.
     """
     move = jnp.asarray(move)
-    opening = move > threshold
-    before, closed = _before(opening), _before(move < -threshold)
-    paused = opening & (before >= 0) & (jnp.arange(move.shape[0]) - before > 1) & (closed < before)
+    rising = move > threshold
+    before, fallen = _before(rising), _before(move < -threshold)
+    paused = rising & (before >= 0) & (jnp.arange(move.shape[0]) - before > 1) & (fallen < before)
     return (paused & (windowed_mean(move, samples)[before] > limit)).sum()
 
 
 @functools.partial(jax.jit, static_argnames="samples", inline=True)
-def opening_above_limit(move: Samples, samples: int, limit: float) -> Count:
-    """Opening moves made although the mean of the `samples` moves before them was above `limit` (6.6).
+def rises_above_limit(move: Samples, samples: int, limit: float) -> Count:
+    """Moves up made although the mean of the `samples` moves before them was above `limit` (6.6).
 
     Both comparisons allow 1e-6 for rounding, in the unit of the move.
     """

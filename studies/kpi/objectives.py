@@ -1,8 +1,8 @@
 """What a search weighs: objectives by name, their values per scenario, and which scenarios none beats.
 
-An objective is a key figure of `studies.kpi.sweep`, with the name of a channel behind it where it has one
-(``mean_absolute_deviation.oil_rate``), or ``deviation``: the mean over the CVs of the mean absolute deviation, each
-divided by its deadzone in the thesis. The front is never stored: `front` computes it from the stored key figures, so that
+An objective is a key figure of `studies.kpi.sweep`, with the name of a channel behind it where it has one (``travel.NAME``
+of an MV), or ``deviation``: the mean over the CVs of the mean absolute deviation, each divided by the half width in which it
+counts as settled. The front is never stored: `front` computes it from the stored key figures, so that
 it always agrees with them, also in a store that is not complete yet.
 """
 
@@ -18,18 +18,15 @@ import numpy as np
 from msgspec import UNSET
 
 from jaxmpc.errors import InputError, near
-from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES
-from studies.definition import presets
+from jaxmpc.process.process import Process
 from studies.definition.sections import Search
-from studies.kpi.sweep import KPIS
+from studies.kpi.sweep import kpis_of
 from studies.store.layout import FLAG
+from studies.store.process import process_in
 from studies.store.reading import open_study, provenance
 
 DEVIATION = "deviation"
-CHANNELS = {(): (), ("cv",): CV_NAMES, ("mv",): MV_NAMES}
-FIGURES = {kpi.name: kpi for kpi in KPIS}
 CLOCK = "solve_time"  # figures of the clock differ from run to run
-THESIS_DEADZONE = tuple(presets.TUNINGS["thesis"]["deadzone"][name] for name in CV_NAMES)
 DIRECTIONS = ("minimize", "maximize")
 
 
@@ -41,33 +38,36 @@ class Objective:
     direction: str  # ``minimize`` or ``maximize``
     figure: str  # key figure that it is made of
     channel: int | None = None  # position of its CV or MV; None without, and for the combined deviation
+    scale: tuple[float, ...] = ()  # of the combined deviation, by CV [CV unit]
 
     def values(self, fields: Mapping[str, Any]) -> np.ndarray:
         """Per scenario, from the stored variables ``"scenario ..."`` by name; NaN for a run that is not complete."""
         figure = np.asarray(fields[self.figure], dtype=float)
         if self.name == DEVIATION:
-            figure = (figure / THESIS_DEADZONE).mean(axis=1)
+            figure = (figure / np.array(self.scale)).mean(axis=1)
         elif self.channel is not None:
             figure = figure[:, self.channel]
         return np.where(np.asarray(fields[FLAG]) > 0, figure, np.nan)
 
 
-def objective(path: str, name: str, direction: str = "minimize") -> Objective:
+def objective(process: Process, path: str, name: str, direction: str = "minimize") -> Objective:
     """The objective of a name; `path` is where the name stands.
 
     Raises:
         InputError: for an unknown name, a figure with channels without one, and figures of the clock.
     """
     if name == DEVIATION:
-        return Objective(name, direction, "mean_absolute_deviation")
+        return Objective(name, direction, "mean_absolute_deviation", scale=tuple(process.settled))
+    figures = {kpi.name: kpi for kpi in kpis_of(process)}
     figure, _, channel = name.partition(".")
-    if figure not in FIGURES:
-        known = [DEVIATION, *FIGURES]
+    if figure not in figures:
+        known = [DEVIATION, *figures]
         raise InputError(path, name, "a key figure of docs/kpis.md, or deviation", near(figure, known))
     if figure.startswith(CLOCK):
         advice = "It depends on the machine and would make the search another one every time"
         raise InputError(path, name, "a key figure that does not depend on the clock", advice)
-    names = CHANNELS[FIGURES[figure].dims]
+    channels = {(): (), ("cv",): process.cv_names, ("mv",): process.mv_names}
+    names = channels[figures[figure].dims]
     if not names:
         if channel:
             raise InputError(path, name, f"{figure} alone: it has no channels")
@@ -78,7 +78,7 @@ def objective(path: str, name: str, direction: str = "minimize") -> Objective:
     return Objective(name, direction, figure, names.index(channel))
 
 
-def objectives_of(search: Search) -> tuple[Objective, ...]:
+def objectives_of(search: Search, process: Process) -> tuple[Objective, ...]:
     """The objectives of a definition, checked.
 
     Raises:
@@ -93,7 +93,7 @@ def objectives_of(search: Search) -> tuple[Objective, ...]:
     for i, (name, direction) in enumerate(zip(names, directions, strict=True)):
         if name in names[:i]:
             raise InputError(f"search.objectives[{i}]", name, "each objective once")
-        out.append(objective(f"search.objectives[{i}]", name, direction))
+        out.append(objective(process, f"search.objectives[{i}]", name, direction))
     return tuple(out)
 
 
@@ -134,7 +134,8 @@ def front(store: str | Path) -> np.ndarray:
         names = provenance(data, "objectives")
         if not isinstance(names, dict):
             raise InputError("store", str(store), "the store of a search, which has objectives")
-        objectives = [objective("objectives", name, direction) for name, direction in names.items()]
+        process = process_in(data)
+        objectives = [objective(process, "objectives", name, direction) for name, direction in names.items()]
         values = costs(objectives, values_of(objectives, data.data_vars))  # type: ignore[arg-type]
         best = np.flatnonzero(unbeaten(values))
         order = np.lexsort(values[best].T[::-1])

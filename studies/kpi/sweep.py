@@ -1,13 +1,14 @@
 """Key figures of sweep scenarios: `studies.kpi.loop` and `studies.kpi.setpoint` on every lane of a chunk at once.
 
-`run_kpis` is pure and has fixed shapes; `batch_kpis` compiles it once per number of lanes and samples. `KPIS`
-names every figure with its unit and formula, in the notation of `kpi.loop`; docs/kpis.md explains them. Everything is a
-float, so that a run whose numbers are not all finite can answer NaN instead of looking good.
+`run_kpis` is pure and has fixed shapes; `batch_kpis` compiles it once per number of lanes and samples. `kpis_of` names every
+figure with its unit and formula, in the notation of `kpi.loop`; docs/kpis.md explains them. Everything is a float, so
+that a run whose numbers are not all finite can answer NaN instead of looking good.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -20,13 +21,12 @@ from jaxmpc.controller.measurement import GOOD
 from jaxmpc.errors import InputError
 from jaxmpc.loop.trajectory import TrajectoryBatch
 from jaxmpc.problem.tuning import Tuning
-from jaxmpc.process.well.equations import CV_NAMES, MV_NAMES
+from jaxmpc.process.process import Process
 from jaxmpc.status import OPTIMAL
 from studies.kpi import loop as kpi
 from studies.kpi import setpoint as kpi_setpoint
 
 ROUNDING = 1e-6  # of a value at its limit, relative to the distance between the limits
-RATE_UNIT = "m3/h"  # of what is integrated to a volume
 _NUMBERS = ("cv", "mv", "mv_demand", "move", "objective", "gap", "solve_time")
 RECORD = (*_NUMBERS, "status", "fallback", "quality", "off")  # fields of `Trajectory` that key figures need
 
@@ -94,21 +94,18 @@ KPIS: tuple[Kpi, ...] = (
         "mv_violations", "samples with the MV outside its limits", "samples", "count_k(x[k] > 1e-6 width)", MV
     ),
     Kpi("mv_largest_excess", "largest excess of the MV over its limits", "mv_unit", "max_k x[k]", MV),
-    Kpi("choke_travel", "sum of absolute choke moves, actual position", "%", "sum_k abs(m[k])"),
-    Kpi("choke_moves", "choke moves", "1", "count_k(abs(m[k]) > 0.05 %)"),
-    Kpi("choke_reversals", "choke moves against the move before", "1", "count_n(m[n] m[n-1] < 0)"),
+    Kpi("travel", "sum of absolute moves, actual position", "mv_unit", "sum_k abs(m[k])", MV),
+    Kpi("moves", "moves", "1", "count_k(abs(m[k]) > smallest move)", MV),
+    Kpi("reversals", "moves against the move before", "1", "count_n(m[n] m[n-1] < 0)", MV),
     Kpi(
         "hunting_reversals",
-        "choke reversals in the second halves of the setpoint windows",
+        "reversals in the second halves of the setpoint windows",
         "1",
         "count_n(m[n] m[n-1] < 0, both late in one window)",
+        MV,
     ),
-    Kpi("mean_dwell", "mean time between successive choke moves", "s", "mean_n(t[n] - t[n-1])"),
-    Kpi("shortest_dwell", "shortest time between successive choke moves", "s", "min_n(t[n] - t[n-1])"),
-    Kpi("lift_travel", "sum of absolute moves of the lift", "m3/h", "sum_k abs(m[k])"),
-    Kpi("lift_volume", "lift gas asked for", "m3", "dt / 3600 sum_k u[k]"),
-    Kpi("oil_produced", "oil produced", "m3", "dt / 3600 sum_k y[k]"),
-    Kpi("gas_produced", "gas produced, lift gas included", "m3", "dt / 3600 sum_k y[k]"),
+    Kpi("mean_dwell", "mean time between successive moves", "s", "mean_n(t[n] - t[n-1])", MV),
+    Kpi("shortest_dwell", "shortest time between successive moves", "s", "min_n(t[n] - t[n-1])", MV),
     Kpi("objective", "mean objective of the applied plans", "1", "mean_k J[k]"),
     Kpi(
         "closed_loop_cost",
@@ -176,33 +173,40 @@ PER_CV = Tuned._fields[:6]
 WEIGHTS = "cv_weight", "soft_quadratic", "soft_linear", "deadzone", "move_weight"  # of the closed-loop cost
 
 
-class Channels(NamedTuple):
-    """Positions of the well's MVs and CVs; static."""
+class Integral(NamedTuple):
+    """A key figure of a process: the integral of a CV or MV over the run; static."""
 
-    choke: int
-    lift: int
-    gas: int
-    oil: int
+    name: str
+    of: str  # cv or mv
+    at: int  # position among them
+    per: float  # seconds of the time unit in the unit of the rate
 
 
-def channels_of(batch: TrajectoryBatch) -> Channels:
-    """Where the MVs and CVs of the well are in a batch, by name.
+class Measures(NamedTuple):
+    """What key figures need of a process."""
 
-    Raises:
-        InputError: if one is missing, or a rate is not in m3/h.
-    """
-    found = []
-    for key, wanted in (("mv", MV_NAMES), ("cv", CV_NAMES)):
-        names, units = getattr(batch, f"{key}_names"), getattr(batch, f"{key}_units")
-        for name in wanted:
-            if name not in names:
-                expected = f"the well's {key.upper()} {name!r} among them"
-                raise InputError(f"batch.{key}_names", list(names), expected)
-            at = names.index(name)
-            if name != MV_NAMES[0] and units[at] != RATE_UNIT:
-                raise InputError(f"batch.{key}_units[{at}]", units[at], f"{RATE_UNIT!r}, the unit of {name}")
-            found.append(at)
-    return Channels(*found)
+    smallest_move: Any  # "mv", what counts as a move is larger [MV unit]
+    integrals: tuple[Integral, ...]  # static
+
+
+def kpis_of(process: Process) -> tuple[Kpi, ...]:
+    """Every key figure of a process: those of every process, and its own integrals before the ones of the steps."""
+    own = [
+        Kpi(figure.name, figure.label, figure.unit, f"dt / {figure.per:g} sum_k {figure.integral_of}[k]")
+        for figure in process.key_figures
+    ]
+    at = [item.name for item in KPIS].index("objective")
+    return (*KPIS[:at], *own, *KPIS[at:])
+
+
+def measures_of(process: Process) -> Measures:
+    """What key figures need of a process."""
+    integrals = []
+    for figure in process.key_figures:
+        of = "cv" if figure.integral_of in process.cv_names else "mv"
+        names = process.cv_names if of == "cv" else process.mv_names
+        integrals.append(Integral(figure.name, of, names.index(figure.integral_of), figure.per))
+    return Measures(np.array([mv.smallest_move for mv in process.mvs]), tuple(integrals))
 
 
 def runs_of(batch: TrajectoryBatch, window) -> Run:
@@ -238,7 +242,12 @@ def run_of(fields: Mapping[str, Any], setpoint, window) -> Run:
 
 
 def run_kpis(
-    run: Run, tuning: Tuned, tolerance: Float[Array, " cv"], dt: float, channels: Channels
+    run: Run,
+    tuning: Tuned,
+    tolerance: Float[Array, " cv"],
+    dt: float,
+    smallest_move: Float[Array, " mv"],
+    integrals: tuple[Integral, ...] = (),
 ) -> dict[str, Array]:
     """Key figures of one run.
 
@@ -247,20 +256,31 @@ def run_kpis(
         tuning: of its controller; what counts as outside the deadzone or a limit, and the weights of the cost.
         tolerance: half width around the setpoint in which a CV counts as settled [CV unit].
         dt: sampling interval [s].
-        channels: from `channels_of`; static under `jax.jit`.
+        smallest_move: what counts as a move is larger [MV unit].
+        integrals: of `Measures`; static under `jax.jit`.
 
     Returns:
-        Every name of `KPIS`, in that order, as floats of its dims. If a CV, setpoint or MV of any sample is not
+        Every name of `kpis_of`, in that order, as floats of its dims. If a CV, setpoint or MV of any sample is not
         finite, all but `ALWAYS` are NaN.
     """
     y, r = run.cv, run.setpoint
     moves = jax.vmap(kpi.moves_of, in_axes=(1, 0), out_axes=1)(run.mv, run.mv_demand[0] - run.move[0])
-    choke, lift = moves[:, channels.choke], moves[:, channels.lift]
     start, end = kpi_setpoint.window_bounds(run.window)
     change = kpi_setpoint.setpoint_change(y, r, tolerance, start)
     settled = kpi_setpoint.settling(y, r, change, tolerance, (start, end), dt)
-    hunting = kpi.reversal_events(choke, segment=kpi_setpoint.late_segment(start, end))
-    mean_dwell, shortest_dwell = kpi.dwell(choke, dt)
+    late = kpi_setpoint.late_segment(start, end)
+
+    def worn(move, smallest):
+        mean_dwell, shortest_dwell = kpi.dwell(move, dt, smallest)
+        return {
+            "travel": kpi.travel(move),
+            "moves": kpi.move_count(move, smallest),
+            "reversals": kpi.reversal_events(move, smallest).sum(),
+            "hunting_reversals": kpi.reversal_events(move, smallest, segment=late).sum(),
+            "mean_dwell": mean_dwell,
+            "shortest_dwell": shortest_dwell,
+        }
+
     cv_limits = y, tuning.cv_low, tuning.cv_high, rounding(tuning.cv_low, tuning.cv_high)
     mv_limits = run.mv, tuning.mv_low, tuning.mv_high, rounding(tuning.mv_low, tuning.mv_high)
     times = kpi.solve_time_statistics(run.solve_time)
@@ -278,16 +298,8 @@ def run_kpis(
         "cv_largest_excess": kpi.largest_excess(*cv_limits),
         "mv_violations": kpi.limit_violations(*mv_limits),
         "mv_largest_excess": kpi.largest_excess(*mv_limits),
-        "choke_travel": kpi.travel(choke),
-        "choke_moves": kpi.move_count(choke),
-        "choke_reversals": kpi.reversal_events(choke).sum(),
-        "hunting_reversals": hunting.sum(),
-        "mean_dwell": mean_dwell,
-        "shortest_dwell": shortest_dwell,
-        "lift_travel": kpi.travel(lift),
-        "lift_volume": kpi.volume(run.mv[:, channels.lift], dt),
-        "oil_produced": kpi.volume(y[:, channels.oil], dt),
-        "gas_produced": kpi.volume(y[:, channels.gas], dt),
+        **jax.vmap(worn, in_axes=(1, 0))(moves, smallest_move),
+        **{i.name: kpi.integral(getattr(run, i.of)[:, i.at], dt, i.per) for i in integrals},
         "objective": run.objective.mean(),
         "closed_loop_cost": kpi.closed_loop_cost(
             y, r, moves, **{name: getattr(tuning, name) for name in WEIGHTS}
@@ -314,7 +326,9 @@ def rounding(low, high):
     return ROUNDING * jnp.where(jnp.isfinite(width), width, 0.0)
 
 
-def batch_kpis(batch: TrajectoryBatch, tunings: Tuning, window, *, tolerance=None) -> dict[str, np.ndarray]:
+def batch_kpis(
+    batch: TrajectoryBatch, tunings: Tuning, window, measures: Measures, *, tolerance=None
+) -> dict[str, np.ndarray]:
     """Key figures of every run of a batch; padding lanes are computed like the others, leaving them out is the caller's.
 
     Args:
@@ -323,16 +337,16 @@ def batch_kpis(batch: TrajectoryBatch, tunings: Tuning, window, *, tolerance=Non
         tunings: one per lane of the batch (`jaxmpc.problem.tuning.stack_tunings`), or one for all.
         window: labels of the setpoint windows, ``"sample"`` or ``"lane sample"``, such as
             `jaxmpc.process.reference.Reference.window` gives.
+        measures: from `measures_of`.
         tolerance: half width around the setpoint in which a CV counts as settled, ``"cv"`` or ``"lane cv"``
             [CV unit]; the deadzone of each lane if not given. Give one where scenarios differ in their deadzone.
 
     Returns:
-        Every name of `KPIS`, ``"lane"``, ``"lane cv"`` or ``"lane mv"``.
+        Every name of `kpis_of`, ``"lane"``, ``"lane cv"`` or ``"lane mv"``.
 
     Raises:
-        InputError: for MVs or CVs that are not the well's, fields that were not recorded, or wrong shapes.
+        InputError: for fields that were not recorded, or wrong shapes.
     """
-    channels = channels_of(batch)
     runs = runs_of(batch, window)
     lanes, cvs, mvs = len(batch), len(batch.cv_names), len(batch.mv_names)
     sizes = {name: (cvs if name in PER_CV else mvs,) for name in Tuned._fields}
@@ -344,8 +358,14 @@ def batch_kpis(batch: TrajectoryBatch, tunings: Tuning, window, *, tolerance=Non
         allowed = _per_lane("tolerance", np.asarray(tolerance, dtype=np.float64), lanes, (cvs,))
         if not (allowed >= 0).all():
             raise InputError("tolerance", tolerance, "half widths, 0 or more [CV unit]")
-    figures = _batched(runs, each, allowed, np.float64(batch.dt), channels)
-    return {item.name: np.array(figures[item.name]) for item in KPIS}
+    figures = _batched(runs, each, allowed, np.float64(batch.dt), measures.smallest_move, measures.integrals)
+    names = [item.name for item in KPIS]
+    order = [
+        *names[: names.index("objective")],
+        *(i.name for i in measures.integrals),
+        *names[names.index("objective") :],
+    ]
+    return {name: np.array(figures[name]) for name in order}
 
 
 def _per_lane(field: str, given, lanes: int, size: tuple[int, ...]) -> Any:
@@ -357,4 +377,7 @@ def _per_lane(field: str, given, lanes: int, size: tuple[int, ...]) -> Any:
     return np.broadcast_to(value, (lanes, *size))
 
 
-_batched = jax.jit(jax.vmap(run_kpis, in_axes=(0, 0, 0, None, None)), static_argnames="channels")
+@functools.partial(jax.jit, static_argnames="integrals")
+def _batched(runs, tunings, tolerance, dt, smallest_move, integrals):
+    figures = functools.partial(run_kpis, integrals=integrals)
+    return jax.vmap(figures, in_axes=(0, 0, 0, None, None))(runs, tunings, tolerance, dt, smallest_move)

@@ -20,17 +20,17 @@ import xarray as xr
 from figures.closed_loop import RUN, of_trajectory
 from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
-from jaxmpc.process.reference import Reference
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.trajectory import RECORDABLE, Trajectory, TrajectoryBatch
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
+from jaxmpc.process.reference import Reference
 from jaxmpc.process.well.plant import WellPlant
 from studies.definition import presets, references
 from studies.definition.models import identify_models
-from studies.definition.presets import CHOKE, GAS, OIL
 from studies.kpi.sweep import KPIS, RECORD, batch_kpis
+from studies.thesis.well import CHOKE, GAS, OIL
 
 Progress = Callable[[int, int], None]
 

@@ -12,31 +12,26 @@ import platform
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from identify.plants import open_plant
 from jaxmpc.controller.controller import Controllers
 from jaxmpc.files import strict_json
 from jaxmpc.loop.simulate import simulate_batches
 from jaxmpc.loop.trajectory import TrajectoryBatch
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.tuning import stack_tunings
-from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS, MV_NAMES, MV_UNITS
-from jaxmpc.process.well.plant import WellPlant
+from jaxmpc.process.plant import JaxPlant, lanes_of_plants
+from jaxmpc.process.process import Process
 from jaxmpc.programs.clock import Clock
 from jaxmpc.programs.lanes import Lanes
 from studies.definition.models import Point, identify_models
 from studies.definition.scenarios import Scenario, Study
-from studies.kpi.objectives import THESIS_DEADZONE
-from studies.kpi.sweep import KPIS, RECORD, batch_kpis
+from studies.kpi.sweep import RECORD, batch_kpis, kpis_of, measures_of
 from studies.store.fingerprint import made_now
 from studies.store.layout import FLAG, StoreLayout, Variable, process_axes
 from studies.store.trajectories import swept
-
-# A CV counts as settled within the deadzone of the thesis, whatever its own: otherwise a wide deadzone settles at once.
-SETTLED = THESIS_DEADZONE
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -58,7 +53,7 @@ class ChunkResult:
 
 def prepare_study(study: Study, progress: Callable[[int, int], None] | None = None) -> PreparedStudy:
     """Identify the models of a study; errors of `models.identify_models`."""
-    models = identify_models(study.model_points, progress=progress)
+    models = identify_models(study.process, study.model_points, progress=progress)
     return PreparedStudy(study, {point: jax.tree.map(np.asarray, model) for point, model in models.items()})
 
 
@@ -72,7 +67,9 @@ def run_chunk(prepared: PreparedStudy, index: int) -> ChunkResult:
         prepared.models,
         lanes=lanes,
         shared_model=len(group.points) == 1,
-        plant_fields=study.varying_plant(chunk.group),
+        process=study.process,
+        plant=study.definition.study.plant,
+        varying=study.varying_plant(chunk.group),
         points=len(stored_times(study)),
         every=study.definition.store.every,
         trajectories=study.definition.store.trajectories,
@@ -88,8 +85,10 @@ def run_scenarios(
     points: int,
     every: int,
     trajectories: Sequence[str],
+    process: Process,
+    plant: str = "",
     shared_model: bool = False,
-    plant_fields: Sequence[str] = (),
+    varying: Sequence[str] = (),
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Run scenarios of one group side by side.
 
@@ -99,7 +98,8 @@ def run_scenarios(
         points: length of the stored time axis; shorter runs end in NaN (-1 for codes).
         every: samples from one stored point to the next.
         trajectories: fields of `Trajectory` to keep.
-        plant_fields: parameters of the well that may differ from lane to lane.
+        plant: which one of the process; the first if not given.
+        varying: parameters of the plant that may differ from lane to lane.
     """
     clock = Clock()
     filled = [*scenarios, *([scenarios[-1]] * (lanes - len(scenarios)))]
@@ -109,7 +109,7 @@ def run_scenarios(
     controllers = Controllers(first.structure, tunings, model, count=lanes)
     references = [s.reference for s in filled]
     seeds: Any = np.array([s.seed for s in filled])
-    cvs = len(CV_NAMES)
+    cvs = len(process.cvs)
 
     def stacked(name: str, *shape: int) -> np.ndarray | None:
         given = [getattr(s, name) for s in filled]
@@ -118,10 +118,10 @@ def run_scenarios(
 
     batches = simulate_batches(
         controllers,
-        _plants(filled, plant_fields),
+        _plants(process, plant, filled, varying),
         references,
         samples=first.samples,
-        disturbance=stacked("disturbance", first.samples),
+        disturbance=stacked("disturbance", first.samples, len(process.disturbances)),
         noise=stacked("noise", cvs),
         seed=seeds,
         faults=stacked("faults", first.samples, cvs),
@@ -132,7 +132,9 @@ def run_scenarios(
     (batch,) = batches
     simulated = clock.seconds
     windows = np.stack([s.reference.window(s.structure.dt, s.samples) for s in filled])
-    figures = batch_kpis(batch, stack_tunings(tunings), windows, tolerance=np.array(SETTLED))
+    figures = batch_kpis(
+        batch, stack_tunings(tunings), windows, measures_of(process), tolerance=process.settled
+    )
     fields = {name: values[: len(scenarios)] for name, values in figures.items()}
     fields[FLAG] = fields["finite"].astype("i1")
     for field in trajectories:
@@ -149,16 +151,16 @@ def run_scenarios(
     return fields, facts
 
 
-def _plants(scenarios: Sequence[Scenario], fields: Sequence[str]) -> Lanes[WellPlant] | WellPlant:
-    """One well per lane, parameters that do not vary within the group kept once; or one for all."""
+def _plants(
+    process: Process, name: str, scenarios: Sequence[Scenario], varying: Sequence[str]
+) -> Lanes[JaxPlant] | JaxPlant:
+    """One plant per lane, parameters that do not vary within the group kept once; or one for all."""
     first = scenarios[0]
-    if not fields:
-        return WellPlant(parameters=first.plant, actuator=first.actuator)
-    varying = {name: jnp.array([getattr(s.plant, name) for s in scenarios]) for name in fields}
-    plants = WellPlant(parameters=dataclasses.replace(first.plant, **varying), actuator=first.actuator)
-    places = lambda plant: [getattr(plant.parameters, name) for name in fields]  # noqa: E731
-    has_lanes = eqx.tree_at(places, jax.tree.map(lambda _: False, plants), [True] * len(fields))
-    return Lanes(*eqx.partition(plants, has_lanes))
+    shared = {key: value for key, value in first.plant.items() if key not in varying}
+    plant = open_plant(process, name, actual=first.actuator == "step", parameters=shared)
+    if not varying:
+        return plant
+    return lanes_of_plants(plant, {key: np.array([s.plant[key] for s in scenarios]) for key in varying})
 
 
 def _kept(batch: TrajectoryBatch, field: str, lanes: int, every: int, points: int) -> np.ndarray:
@@ -182,6 +184,7 @@ def study_layout(study: Study, command: str | None = None) -> StoreLayout:
     Args:
         command: words after ``jaxmpc study run`` that give it: a shipped name or a file, and ``--quick``.
     """
+    process = study.process
     noise = "the column seed" if any(c.key == "seed" for c in study.columns) else study.scenario(0).seed
     return StoreLayout(
         name=study.name,
@@ -191,9 +194,11 @@ def study_layout(study: Study, command: str | None = None) -> StoreLayout:
         chunk_scenarios=tuple(chunk.scenarios for chunk in study.chunks),
         scenario_hashes=study.scenario_hashes,
         columns=study.columns,
-        variables=stored_variables(study.definition.store.trajectories),
+        variables=stored_variables(process, study.definition.store.trajectories),
         coords=process_axes(
-            stored_times(study), {"cv": CV_NAMES, "mv": MV_NAMES}, {"cv": CV_UNITS, "mv": MV_UNITS}
+            stored_times(study),
+            {"cv": process.cv_names, "mv": process.mv_names},
+            {"cv": tuple(v.unit for v in process.cvs), "mv": tuple(v.unit for v in process.mvs)},
         ),
         provenance={
             "definition": strict_json(study.definition.body),
@@ -201,15 +206,15 @@ def study_layout(study: Study, command: str | None = None) -> StoreLayout:
             "folder": str(study.definition.folder),
             "quick": study.definition.is_cut,
             "seeds": {"sampling": study.definition.sampling.seed, "noise": noise},
-            "settled": dict(zip(CV_NAMES, SETTLED, strict=True)),
+            "process": strict_json(process.body),
             "work": dataclasses.asdict(study.work),
             **made_now(),
         },
     )
 
 
-def stored_variables(trajectories: Sequence[str]) -> tuple[Variable, ...]:
+def stored_variables(process: Process, trajectories: Sequence[str]) -> tuple[Variable, ...]:
     """Key figures, the flag of a complete run, and trajectories."""
-    figures = [Variable(k.name, k.long_name, k.unit, k.dims) for k in KPIS]
+    figures = [Variable(k.name, k.long_name, k.unit, k.dims) for k in kpis_of(process)]
     flag = Variable(FLAG, "1 where every CV and MV of the run is finite", "1", (), "i1", 0)
     return (*figures, flag, *(swept(field) for field in trajectories))

@@ -21,12 +21,15 @@ from tqdm import tqdm
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.schedule import ModelSchedule, ScheduledController
 from jaxmpc.errors import InputError
+from jaxmpc.files import strict_json
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.problem.tuning import Tuning
+from jaxmpc.process.file import process_digest
+from jaxmpc.process.process import Process
 from jaxmpc.programs.clock import Clock
 from studies.definition.comparison import ComparisonDefinition, ControllerDefinition
 from studies.run.progress import looks
@@ -42,12 +45,13 @@ Say = Callable[[str], None]
 
 def run_comparison(
     definition: ComparisonDefinition,
+    process: Process,
     folder: Path,
     *,
     model: StepResponseModel,
-    make_plant: Callable[[str], Any],
+    make_plant: Callable[[bool], Any],
     plant_facts: dict[str, Any],
-    extra: Callable[[], dict[str, xr.DataArray]],
+    extra: Callable[[], Mapping[str, xr.DataArray]],
     others: Sequence[Path] = (),
     schedule: ModelSchedule | None = None,
     progress: bool = True,
@@ -57,7 +61,8 @@ def run_comparison(
 
     Args:
         folder: of the study, writable and locked by the caller.
-        make_plant: the plant with a given actuator, in its initial state.
+        process: that is controlled.
+        make_plant: the plant in its initial state, with its actual actuators or with continuous ones.
         plant_facts: JSON-like; identifies the plant, part of every hash.
         extra: computes further variables of the results (sweep, steady-state map); called for a new store.
         others: stores of other studies, for a new store to take equal runs from.
@@ -70,6 +75,7 @@ def run_comparison(
         "disturbance": msgspec.to_builtins(definition.disturbance),
         "model": np.asarray(model.coefficients),
         "model_dt": model.dt,
+        "process": process_digest(process),
         "code": code,
     }
     scheduled: dict[str, Any] = {}
@@ -77,16 +83,16 @@ def run_comparison(
         parts = schedule.choke, schedule.lift, schedule.coefficients
         scheduled["schedule"] = [np.asarray(part) for part in parts]
     hashes = [
-        content_hash(inputs | (scheduled if controller.schedule else {}), controller.resolved())
+        content_hash(inputs | (scheduled if controller.schedule else {}), controller.resolved(process))
         for controller in definition.controllers
     ]
     study_hash = content_hash(FORMAT, msgspec.to_builtins(definition), hashes)
-    layout = comparison_layout(definition, model, extra, hashes, study_hash, plant_facts, code)
+    layout = comparison_layout(definition, process, model, extra, hashes, study_hash, plant_facts, code)
 
     def run(i: int) -> Trajectory:
         controller = definition.controllers[i]
         given = {"schedule": schedule} if controller.schedule else {}
-        return run_controller(controller, definition, model, make_plant, progress, **given)
+        return run_controller(controller, definition, process, model, make_plant, progress, **given)
 
     return run_missing(folder, layout, run, say, others)
 
@@ -143,13 +149,14 @@ def is_current(definition: ComparisonDefinition, folder: Path) -> bool:
 def run_controller(
     definition: ControllerDefinition,
     comparison: ComparisonDefinition,
+    process: Process,
     model: StepResponseModel,
-    make_plant: Callable[[str], Any],
+    make_plant: Callable[[bool], Any],
     progress: bool = True,
     schedule: ModelSchedule | None = None,
 ) -> Trajectory:
     """One closed loop of a comparison."""
-    structure = definition.structure()
+    structure = definition.structure(process)
 
     def controller(tuning: Tuning) -> Controller:
         if definition.schedule:
@@ -158,14 +165,15 @@ def run_controller(
             return ScheduledController(structure, tuning, schedule, time_limit=definition.time_limit)
         return Controller(structure, tuning, model, time_limit=definition.time_limit)
 
-    plant = make_plant(definition.actuator)
+    plant = make_plant(definition.actuator == "step")
     with progress_bar(definition.label, progress) as report, closing(plant):
         return simulate(
-            controller(definition.build_tuning()),
+            controller(definition.build_tuning(process)),
             plant,
-            comparison.reference.build(),
-            disturbance=comparison.offsets(structure.dt),
-            changes=[(at, controller(tuning)) for at, tuning in definition.later_tunings()],
+            comparison.reference.build(process),
+            disturbance=comparison.offsets(process),
+            position_feedback=definition.position_feedback,
+            changes=[(at, controller(tuning)) for at, tuning in definition.later_tunings(process)],
             open_loop_from=definition.open_loop_from,
             keep_plans=True,
             progress=report,
@@ -245,16 +253,17 @@ def results_layout(
 
 def comparison_layout(
     definition: ComparisonDefinition,
+    process: Process,
     model: StepResponseModel,
-    extra: Callable[[], dict[str, xr.DataArray]],
+    extra: Callable[[], Mapping[str, xr.DataArray]],
     hashes: Sequence[str],
     study_hash: str,
     plant_facts: dict[str, Any],
     code: dict[str, str],
 ) -> StoreLayout:
     """The store of a comparison: setpoints, tuning, model and provenance."""
-    first = definition.controllers[0].structure()
-    reference = definition.reference.build()
+    first = definition.controllers[0].structure(process)
+    reference = definition.reference.build(process)
     if model.cv_names != first.cv_names or model.mv_names != first.mv_names:
         raise InputError(
             "model.cv, model.mv",
@@ -263,18 +272,19 @@ def comparison_layout(
         )
     if abs(model.dt - first.dt) > 1e-9:
         raise InputError("model.dt", model.dt, f"the sampling interval of the controllers, {first.dt} s")
-    structures = [controller.structure() for controller in definition.controllers]
+    structures = [controller.structure(process) for controller in definition.controllers]
     return results_layout(
         controllers={controller.name: controller.label for controller in definition.controllers},
         hashes=hashes,
         structure=first,
         samples=reference.samples(first.dt),
         blocks=max(structure.block_count for structure in structures),
-        shared=lambda: _shared(definition, model) | extra(),
+        shared=lambda: {**_shared(definition, process, model), **extra()},
         provenance={
             "study": definition.name,
             "title": definition.title,
             "definition": msgspec.to_builtins(definition),
+            "process": strict_json(process.body),
             "structures": [dataclasses.asdict(structure) for structure in structures],
             "plant": plant_facts,
             "model": {"working_point": dict(model.working_point), "provenance": dict(model.provenance)},
@@ -290,27 +300,35 @@ def labelled(values: Any, dims: Sequence[str], long_name: str, unit: str, **axes
     return xr.DataArray(values, coords, dims, attrs={"long_name": long_name, "units": unit})
 
 
-def _shared(definition: ComparisonDefinition, model: StepResponseModel) -> dict[str, xr.DataArray]:
+def _shared(
+    definition: ComparisonDefinition, process: Process, model: StepResponseModel
+) -> dict[str, xr.DataArray]:
     """Setpoints, disturbance, model and the controllers' tuning."""
-    reference, dt = definition.reference.build(), model.dt
+    reference, dt = definition.reference.build(process), model.dt
     window = reference.window(dt).astype("i4")
     lag = dt * np.arange(1, model.samples + 1), "time after the step", "s"
     coefficients = np.asarray(model.coefficients)
     return {
         "setpoint": labelled(reference.sample(dt), ("time", "cv"), "setpoint", "cv_unit"),
         "window": labelled(window, ("time",), "index of the setpoint window", "1"),
-        "disturbance": labelled(definition.offsets(dt), ("time",), "offset of the reservoir pressure", "bar"),
+        "disturbance": labelled(
+            definition.offsets(process),
+            ("time", "disturbance_name"),
+            "disturbances",
+            "unit of the disturbance",
+            disturbance_name=(list(process.disturbance_names), "disturbance", ""),
+        ),
         "model_coefficient": labelled(
             coefficients, ("cv", "mv", "lag"), "step-response coefficient", "cv_unit per mv_unit", lag=lag
         ),
-        **_controller_variables(definition),
+        **_controller_variables(definition, process),
     }
 
 
-def _controller_variables(definition: ComparisonDefinition) -> dict[str, xr.DataArray]:
+def _controller_variables(definition: ComparisonDefinition, process: Process) -> dict[str, xr.DataArray]:
     """Tuning and kind of every controller, as variables over ``controller``."""
-    tunings = [controller.build_tuning() for controller in definition.controllers]
-    structures = [controller.structure() for controller in definition.controllers]
+    tunings = [controller.build_tuning(process) for controller in definition.controllers]
+    structures = [controller.structure(process) for controller in definition.controllers]
     out = {}
     for key, field in TUNING.items():
         values = np.stack([np.asarray(getattr(tuning, key), dtype=float) for tuning in tunings])
@@ -330,5 +348,6 @@ def _controller_variables(definition: ComparisonDefinition) -> dict[str, xr.Data
         out[key] = labelled(values, ("controller",), what, "1")
     for key in ("kind", "actuator", "blocking", "tuning"):
         values = np.array([getattr(controller, key) for controller in definition.controllers], dtype=object)
+        values = np.where(values == "", process.default_preset, values) if key == "tuning" else values
         out["tuning_preset" if key == "tuning" else key] = xr.DataArray(values, dims="controller")
     return out

@@ -236,7 +236,7 @@ def expand_search(definition: StudyDefinition, *, confirmed: bool = False) -> Se
     """
     search = definition.search
     assert search is not None
-    objectives = objectives_of(search)
+    objectives = objectives_of(search, definition.process)
     if not definition.axes:
         raise InputError("axes", "nothing", "one axis or more to search along, each headed [[axes]]")
     parameters = tuple(parameter_of(definition, i) for i in range(len(definition.axes)))

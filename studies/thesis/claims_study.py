@@ -14,17 +14,17 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from identify.plants import open_plant
 from jaxmpc.files import write_atomically
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.host import HostPlant
-from jaxmpc.process.well.plant import WellPlant
-from studies.definition.comparison import ComparisonDefinition, PlantKind, ReferenceDefinition
+from studies.definition.catalogue import Comparison
+from studies.definition.comparison import ReferenceDefinition
 from studies.run.comparison import is_current, run_controller
 from studies.store.reading import open_results
 from studies.store.writing import check_writable
 from studies.thesis import catalogue
 from studies.thesis.claims import ROWS, Claim, Evidence, judge, tables
-from studies.thesis.comparison import study_name
 
 FORMAT = "jaxmpc/claims/1"
 NEEDED = tuple(dict.fromkeys(row.study for row in ROWS))  # keys of `studies.thesis.catalogue.STUDIES`
@@ -35,7 +35,7 @@ GALLERY = "../../figures-out/index.html"  # where `jaxmpc figures all` puts it
 def run_claims(
     out: str | Path = "results",
     quick: bool = False,
-    plant: PlantKind = "fmu",
+    plant: str = catalogue.PLANTS[0],
     *,
     progress: bool = True,
     say: Callable[[str], None] = print,
@@ -44,26 +44,26 @@ def run_claims(
     """Measure every row on the studies of the catalogue; what of them is stored and current is not run again.
 
     Args:
-        out, quick, plant, progress, say: as for `studies.thesis.catalogue.run_named`.
+        out, quick, plant, progress, say: as for `studies.thesis.catalogue.run_thesis`.
         gallery: page of the figures for the links of ``claims.html``, relative to it.
 
     Returns:
         The folder ``claims-PLANT`` or ``claims-quick-PLANT`` with ``claims.md``, ``claims.csv``, ``claims.json`` and
-        ``claims.html``; errors as for `run_named`.
+        ``claims.html``; errors as for `run_thesis`.
     """
-    folder = check_writable(Path(out) / study_name("claims", quick, plant))
+    folder = check_writable(Path(out) / catalogue.study_name("claims", quick, plant))
     found: dict[str, Claim] = {}
     hashes: dict[str, str] = {}
     for study in NEEDED:
-        definition = catalogue.STUDIES[study](quick, plant)
-        results = Path(out) / definition.name
-        if is_current(definition, results):
+        comparison = catalogue.comparison_of(study, quick, plant)
+        results = Path(out) / comparison.definition.name
+        if is_current(comparison.definition, results):
             say(f"{results}: complete.")
         else:
-            results = catalogue.run_named(study, out, quick, plant, progress=progress, say=say)
+            results = catalogue.run_thesis(study, out, quick, plant, progress=progress, say=say)
         data = open_results(results).load()
         hashes[study] = str(data.attrs["study_hash"])
-        clock = _Clock(definition, results, folder / "times.json", progress, say)
+        clock = _Clock(comparison, results, folder / "times.json", progress, say)
         evidence = Evidence.of(data, clock if plant == "jax" else None)
         found |= {row.id: judge(row, evidence) for row in ROWS if row.study == study}
     claims = [found[row.id] for row in ROWS]
@@ -73,7 +73,7 @@ def run_claims(
 
 
 def _write(
-    claims: list[Claim], folder: Path, quick: bool, plant: PlantKind, hashes: dict[str, str], gallery: str
+    claims: list[Claim], folder: Path, quick: bool, plant: str, hashes: dict[str, str], gallery: str
 ) -> None:
     """Write the rows as ``claims.md``, ``claims.csv``, ``claims.json`` and ``claims.html``, each in one go."""
     title = "The statements of the thesis, measured"
@@ -91,7 +91,7 @@ def _write(
 class _Clock:
     """Times of controller steps by the name of the run; measured once, then read from a file."""
 
-    definition: ComparisonDefinition
+    comparison: Comparison
     results: Path
     file: Path
     progress: bool
@@ -102,9 +102,9 @@ class _Clock:
             key = str(data.sel(controller=name).controller_hash.item())
         known = _read(self.file, self.say)
         if key not in known:
-            self.say(f"{self.definition.name}, {name}: timed on the host.")
+            self.say(f"{self.comparison.definition.name}, {name}: timed on the host.")
             model = StepResponseModel.load(self.results / "model.json")
-            known[key] = step_times(self.definition, name, model, self.progress).tolist()
+            known[key] = step_times(self.comparison, name, model, self.progress).tolist()
             write_atomically(self.file, json.dumps(known))
         return np.array(known[key])
 
@@ -121,14 +121,15 @@ def _read(file: Path, say: Callable[[str], None]) -> dict[str, list[float]]:
 
 
 def step_times(
-    definition: ComparisonDefinition, name: str, model: StepResponseModel, progress: bool = False
+    comparison: Comparison, name: str, model: StepResponseModel, progress: bool = False
 ) -> np.ndarray:
     """Times of the controller steps of a run on the JAX well [s], ``"sample"``: its first `TIMED` seconds, on the host."""
+    definition, process = comparison.definition, comparison.process
     whole = definition.reference
     duration = min(whole.duration, TIMED)
     count = sum(start < duration for start in whole.times)
     reference = ReferenceDefinition(whole.times[:count], whole.setpoints[:count], duration)
     part = msgspec.structs.replace(definition, reference=reference)
     controller = next(one for one in definition.controllers if one.name == name)
-    well = lambda actuator: HostPlant(WellPlant(actuator=actuator))  # noqa: E731
-    return np.asarray(run_controller(controller, part, model, well, progress).solve_time)
+    well = lambda actual: HostPlant(open_plant(process, "jax", actual=actual))  # noqa: E731
+    return np.asarray(run_controller(controller, part, process, model, well, progress).solve_time)

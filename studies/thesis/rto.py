@@ -15,30 +15,29 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from identify.plants import model_of, open_plant, plant_facts
 from identify.steady_map import steady_map
-from identify.step_test import identify_step_response
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.targets import TargetController
 from jaxmpc.files import write_atomically
-from jaxmpc.process.reference import Reference
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.targets import simulate_with_targets
 from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure
+from jaxmpc.process.reference import Reference
 from jaxmpc.steady.map import SteadyMap
 from jaxmpc.steady.optimise import LIFT_RANGES, Targets, optimise
-from studies.definition import presets
-from studies.definition.comparison import PlantKind
-from studies.definition.presets import CHOKE, GAS, LIFT, OIL
 from studies.run.comparison import closing, labelled, progress_bar, results_layout, run_missing
 from studies.store.files import RESULTS
 from studies.store.fingerprint import content_hash, module_hash, source_hash
 from studies.store.layout import StoreLayout
 from studies.store.reading import open_results
 from studies.store.writing import check_writable, locked
-from studies.thesis.comparison import over_inputs, plant_factory, study_name
-from studies.thesis.tables import markdown_table
+from studies.tables import markdown_table
+from studies.thesis.catalogue import study_name
+from studies.thesis.steady import over_inputs
+from studies.thesis.well import CHOKE, GAS, LIFT, OIL, WELL
 
 WITHOUT, WITH = "without-rto", "with-rto"
 LABELS = {WITHOUT: "mixed-integer MPC", WITH: "mixed-integer MPC below an RTO"}
@@ -66,7 +65,7 @@ def demands(quick: bool = False) -> Reference:
 def targets_of(steady: SteadyMap, demanded: Reference, deadzone: np.ndarray) -> list[Targets]:
     """What the real-time optimisation makes of each demand: the most profitable point within its deadzone [CV unit]."""
     return [
-        optimise(steady, PRICES, rates - deadzone, rates + deadzone, choke_step=presets.CHOKE_STEP)
+        optimise(steady, PRICES, rates - deadzone, rates + deadzone, choke_step=WELL.mvs[0].actuator.step)
         for rates in demanded.setpoints
     ]
 
@@ -74,7 +73,7 @@ def targets_of(steady: SteadyMap, demanded: Reference, deadzone: np.ndarray) -> 
 def run_rto(
     out: str | Path = "results",
     quick: bool = False,
-    plant: PlantKind = "jax",
+    plant: str = "jax",
     *,
     progress: bool = True,
     say: Callable[[str], None] = print,
@@ -84,22 +83,22 @@ def run_rto(
     Args:
         quick: 1,200 instead of 2,880 samples.
         plant: ``jax``, or ``fmu``, whose steady map takes longer.
-        out, progress, say: as for `studies.thesis.catalogue.run_named`.
+        out, progress, say: as for `studies.thesis.catalogue.run_thesis`.
 
     Returns:
         The folder of the study, with ``results.zarr`` (see `studies.store.reading.open_results`), ``model.json``,
-        ``steady_map.json`` and ``summary.md``, where both runs settle; errors as for `run_named`.
+        ``steady_map.json`` and ``summary.md``, where both runs settle; errors as for `run_thesis`.
     """
     folder = check_writable(Path(out) / study_name("rto", quick, plant))
     demanded = demands(quick)
     with locked(folder / RESULTS):
-        make_plant, facts = plant_factory(plant, say)
-        with closing(make_plant("continuous")) as tested:
-            model, steady = identify_step_response(tested), steady_map(tested)
+        with closing(open_plant(WELL, plant, actual=False)) as tested:
+            model, steady = model_of(WELL, tested), steady_map(tested)
+            facts = plant_facts(WELL, plant, tested)
         model.save(folder / "model.json")
         steady.save(folder / "steady_map.json")
-        structure = presets.structure(integer=True)
-        tuning = presets.tuning(structure)
+        structure = WELL.structure(integer=True)
+        tuning = WELL.tuning(structure)
         found = targets_of(steady, demanded, np.asarray(tuning.deadzone))
         for rates, each in zip(demanded.setpoints, found, strict=True):
             say(
@@ -111,7 +110,7 @@ def run_rto(
 
         def run(i: int) -> Trajectory:
             name, label = list(LABELS.items())[i]
-            with closing(make_plant("step")) as well, progress_bar(label, progress) as report:
+            with closing(open_plant(WELL, plant)) as well, progress_bar(label, progress) as report:
                 if name == WITHOUT:
                     return simulate(Controller(structure, tuning, model), well, demanded, progress=report)
                 setpoints, ideal = (
@@ -144,7 +143,7 @@ def _layout(
         "map": shared["map_rate"].values,
         "demands": [demanded.times.tolist(), demanded.setpoints.tolist(), demanded.duration],
         "prices": PRICES,
-        "tuning": presets.tuning_fields(),
+        "tuning": WELL.tuning_fields(),
         "code": code,
     }
     hashes = [content_hash(inputs, WITHOUT), content_hash(inputs, WITH, TARGET_WEIGHT)]

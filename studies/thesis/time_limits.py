@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax
@@ -16,7 +15,9 @@ import xarray as xr
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.core import ControllerState, Core
 from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.process.process import Process
 from jaxmpc.status import LIMIT
+from studies.definition.catalogue import Comparison
 from studies.definition.comparison import ControllerDefinition
 
 
@@ -30,19 +31,17 @@ class LimitedSteps(NamedTuple):
     lost: tuple[float, float, float]
 
 
-def limited_steps(
-    data: xr.Dataset, definitions: Iterable[ControllerDefinition], model: StepResponseModel
-) -> list[LimitedSteps]:
+def limited_steps(data: xr.Dataset, comparison: Comparison, model: StepResponseModel) -> list[LimitedSteps]:
     """What the time limits of finished runs cost, one entry per controller with a limit; NaN where no step reached it."""
     out = []
-    for definition in definitions:
+    for definition in comparison.definition.controllers:
         if definition.time_limit is None:
             continue
         run = data.sel(controller=definition.name)
         at = run.status.values == LIMIT
         gap, lost = np.nan, (np.nan, np.nan, np.nan)
         if at.any():
-            loss = objective_loss(data, definition, model)[at]
+            loss = objective_loss(data, definition, comparison.process, model)[at]
             gap = float(np.median(run.gap.values[at]))
             lost = tuple(np.nanpercentile(loss, (50, 90, 100)).tolist())
         out.append(LimitedSteps(definition.label, float(at.mean()), gap, lost))
@@ -50,7 +49,7 @@ def limited_steps(
 
 
 def objective_loss(
-    data: xr.Dataset, definition: ControllerDefinition, model: StepResponseModel
+    data: xr.Dataset, definition: ControllerDefinition, process: Process, model: StepResponseModel
 ) -> np.ndarray:
     """What a time limit cost every plan of a stored run, ``"sample"``: objective over the exact optimum, less one.
 
@@ -58,9 +57,9 @@ def objective_loss(
     are solved again without one. Zero for steps that were solved to the end, not a number for steps without a plan.
     """
     run = data.sel(controller=definition.name).load()
-    exact = Controller(definition.structure(), definition.build_tuning(), model)
+    exact = Controller(definition.structure(process), definition.build_tuning(process), model)
     cv, setpoint, move = run.measurement.values, run.setpoint.values, run.move.values
-    blocks = definition.structure().block_count
+    blocks = exact.structure.block_count
     plan = np.zeros((len(cv), *exact.core.layout.length.shape, move.shape[1]))
     plan[:, :blocks] = run.plan.values[:, :blocks]
     plan[:, 0] = move

@@ -26,7 +26,7 @@ from studies.definition.presets import CHOKE
 from studies.notebooks import launch
 from studies.notebooks import loop as explore
 from studies.notebooks.loop import RUN, Settings, main, run, shown_figures, written
-from studies.thesis.plans import plan_at
+from studies.plans import plan_at
 from tests import studies_synthetic
 from tests.sweep_synthetic import DEADZONE, OIL_DEADZONE, WEIGHT, grid, numbers, runs, write
 

@@ -15,7 +15,7 @@ from studies.bench.context import Context
 from studies.bench.instances import Kind, Mode, Recording, make_controller
 from studies.bench.judge import taken
 from studies.bench.rows import Goal, Row, timed, whole
-from studies.definition import presets, references
+from studies.thesis.well import CHOKE, LIFT, WELL
 
 RUN_SECONDS, RUN_AIM, RUN_SAMPLES = 20.0, 6.0, 7800  # floor and aim of the thesis run
 
@@ -71,12 +71,12 @@ def broken_limits(run: Recording, kind: Kind, mode: Mode, context: Context) -> n
 def variants(context: Context, integer: bool) -> Row:
     """Variants advanced together: the move weights of their chokes differ."""
     size, mode = context.size, context.size.modes[0]
-    structure = presets.structure(mode, integer=integer)
+    structure = WELL.structure(mode, integer=integer)
     if integer:
         kind, count, samples, goal = "mixed-integer", size.together, size.together_samples, (800.0, 5000.0)
     else:
         kind, count, samples, goal = "continuous", size.variants, size.variant_samples, (4000.0, 20000.0)
-    reference = (size.together_reference if integer else references.quick)()
+    reference = WELL.reference(size.together_reference if integer else "quick")
     controllers = Controllers(structure, _tunings(structure, count), context.model)
     context.say(f"{count} {kind} variants, {samples} samples")
     run = lambda: simulate_batch(controllers, WellPlant(actuator="step"), reference, samples=samples)  # noqa: E731
@@ -94,5 +94,5 @@ def variants(context: Context, integer: bool) -> Row:
 
 def _tunings(structure: Structure, count: int) -> list[Tuning]:
     weights = np.geomspace(60.0, 2000.0, count).tolist()  # 1/(%)^2
-    changes = ({"move_weight": {presets.CHOKE: weight, presets.LIFT: 0.2}} for weight in weights)
-    return [presets.tuning(structure, changes=change) for change in changes]
+    changes = ({"move_weight": {CHOKE: weight, LIFT: 0.2}} for weight in weights)
+    return [WELL.tuning(structure, changes=change) for change in changes]

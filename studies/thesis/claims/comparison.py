@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from studies.definition.presets import CHOKE
-from studies.kpi.evaluate import distance_to_reach, final_deviation, window_deviation
+from studies.kpi.evaluate import final_deviation, window_deviation
 from studies.thesis.claims.limits import ALIKE, FAR_MORE, HUNTING, OUT_OF_REACH, STATIONARY
 from studies.thesis.claims.record import Evidence, Finding, Run, name_of, short
 from studies.thesis.claims.why import price_of_a_step
+from studies.thesis.reach import distance_to_reach, reversals_near_closed
+from studies.thesis.well import CHOKE
 
 # ------------------------------------------------------------------------------------------------ oscillation
 
@@ -43,7 +44,7 @@ def oscillates(evidence: Evidence, run: Run) -> Finding:
 def below_half(evidence: Evidence, run: Run) -> Finding:
     """Most reversals happen with the choke near closed."""
     hunts, numbers = hunting(evidence, run)
-    low, total = evidence.figure("late_reversals_near_closed", run), numbers["total"]
+    low, total = reversals_near_closed(evidence.data, name_of(run)), numbers["total"]
     return Finding(
         (low > total / 2,) if hunts.any() else (), {"low": low, "total": total, "high": total - low}
     )
@@ -51,7 +52,7 @@ def below_half(evidence: Evidence, run: Run) -> Finding:
 
 def travels(evidence: Evidence, rounded: Run, integer: Run) -> Finding:
     """Rounding travels far more."""
-    far, near = (evidence.figure("choke_travel", run) for run in (rounded, integer))
+    far, near = (evidence.figure("travel", run) for run in (rounded, integer))
     numbers = {"far": far, "near": near, "ratio": far / max(near, 1e-9), "more": far - near}
     return Finding((far > near, far > FAR_MORE * near), numbers)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from studies.definition.presets import LIFT, OIL
 from studies.store.reading import provenance
 from studies.thesis.claims.limits import LATE, PRECISE, REST, STATIONARY
 from studies.thesis.claims.record import (
@@ -18,6 +17,7 @@ from studies.thesis.claims.record import (
     name_of,
 )
 from studies.thesis.claims.why import compromise, exchange, price_of_a_step
+from studies.thesis.well import LIFT, OIL
 
 
 def _lift(run: Run) -> np.ndarray:

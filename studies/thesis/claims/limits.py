@@ -1,6 +1,6 @@
 """What counts as what in the statements of the thesis; `rows.toml` writes these numbers by their names."""
 
-from studies.kpi.evaluate import NEAR_CLOSED as NEAR_CLOSED
+from studies.thesis.reach import NEAR_CLOSED as NEAR_CLOSED
 
 STATIONARY = 0.25  # deadzone half widths of mean deviation that count as arrived
 PRECISE = 0.1  # half widths of deviation that count as none

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from studies.definition.presets import CHOKE
 from studies.thesis.claims.record import Evidence, Finding, Run
+from studies.thesis.well import CHOKE
 
 
 def staircase(evidence: Evidence) -> Finding:
     """No opening above the mean-move limit, and pauses."""
-    key = evidence.key
-    stops, broken = key.mean_move_stops.values, key.openings_above_limit.values
+    key = evidence.key.sel(mv=CHOKE)
+    stops, broken = key.mean_move_stops.values, key.rises_above_limit.values
     numbers = {
         "means": _means(evidence),
         "broken": ", ".join(map(str, broken)),
@@ -21,7 +21,7 @@ def staircase(evidence: Evidence) -> Finding:
 
 
 def _means(evidence: Evidence) -> str:
-    return ", ".join(f"{mean:.3f}" for mean in evidence.key.largest_mean_opening.values)
+    return ", ".join(f"{mean:.3f}" for mean in evidence.key.largest_mean_rise.sel(mv=CHOKE).values)
 
 
 def mean_move(evidence: Evidence) -> Finding:
@@ -29,7 +29,7 @@ def mean_move(evidence: Evidence) -> Finding:
     data = evidence.data
     limit = data.tuning_mean_move_limit.sel(mv=CHOKE).values
     step = data.tuning_move_high.sel(mv=CHOKE).values / data.mean_move_window.values
-    below = evidence.key.largest_mean_opening.values <= limit + step + 1e-6
+    below = evidence.key.largest_mean_rise.sel(mv=CHOKE).values <= limit + step + 1e-6
     return Finding(tuple(below), {"means": _means(evidence), "limit": limit.max(), "step": step.max()})
 
 

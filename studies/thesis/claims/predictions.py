@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from studies.definition.presets import CHOKE, GAS, LIFT, OIL
+from studies.plans import StoredPlan, plan_at
 from studies.thesis.claims.limits import FIRST, PLAN_ALIKE, STATIONARY
 from studies.thesis.claims.record import Evidence, Finding, Run, index, late_deviation, name_of
 from studies.thesis.claims.why import exchange
-from studies.thesis.plans import StoredPlan, plan_at
+from studies.thesis.well import CHOKE, GAS, LIFT, OIL
 
 
 def _changed_at(run: Run) -> int:

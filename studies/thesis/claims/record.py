@@ -15,11 +15,11 @@ import msgspec
 import numpy as np
 import xarray as xr
 
-from studies.definition.presets import CHOKE, GAS, LIFT, OIL
 from studies.kpi.evaluate import completed, key_figures
 from studies.kpi.loop import moves_of, travel
 from studies.thesis.claims import limits
 from studies.thesis.claims.limits import LATE
+from studies.thesis.well import CHOKE, GAS, LIFT, OIL
 
 VERDICTS = ("holds", "holds in part", "does not hold", "not tested")
 ROLES = {  # by kind of controller and actuator, whatever the run is called
@@ -123,8 +123,9 @@ class Evidence:
         return [self.data.isel(controller=i) for i in range(self.data.sizes["controller"])]
 
     def figure(self, name: str, run: Run) -> Any:
-        """A key figure of one run: a number or an array."""
-        return self.key[name].sel(controller=name_of(run)).values[()]
+        """A key figure of one run: a number or an array; that of the choke, where it has one per MV."""
+        found = self.key[name].sel(controller=name_of(run))
+        return (found.sel(mv=CHOKE) if "mv" in found.dims else found).values[()]
 
     def rates(self, values: np.ndarray) -> Rates:
         """Numbers ``"cv"`` for the words of a row."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from studies.definition.presets import CHOKE, GAS, OIL
-from studies.kpi.evaluate import NEAR_CLOSED, distance_to_reach, final_deviation
+from studies.kpi.evaluate import final_deviation
 from studies.kpi.loop import second_halves
 from studies.thesis.claims.comparison import hunting, off_windows
 from studies.thesis.claims.limits import FULL, NEARLY_CLOSED, OUT_OF_REACH, STATIONARY, STEP
 from studies.thesis.claims.record import Evidence, Finding, Run, index, name_of, quarters, short, swing
 from studies.thesis.claims.why import compromise, exchange
+from studies.thesis.reach import NEAR_CLOSED, distance_to_reach
+from studies.thesis.well import CHOKE, GAS, OIL
 
 # ------------------------------------------------------------------------------------------------ convergence
 

@@ -6,12 +6,12 @@ import itertools
 
 import numpy as np
 
-from studies.definition.presets import CHOKE, OIL
 from studies.kpi.loop import moves_of, reversal_events, second_halves
+from studies.plans import plan_at
 from studies.thesis.claims.limits import FAR, FAR_MORE, HUNTING, MOST, NEARLY_CLOSED
 from studies.thesis.claims.record import Evidence, Finding, Run, index, name_of
 from studies.thesis.claims.why import horizon_cost
-from studies.thesis.plans import plan_at
+from studies.thesis.well import CHOKE, OIL
 
 
 def turns(run: Run) -> np.ndarray:
@@ -79,7 +79,7 @@ def penalises_less(evidence: Evidence, nominal: Run, soft: Run) -> Finding:
 def better(evidence: Evidence, *runs: Run) -> Finding:
     """Soft MPC turns and travels less than without its penalty, or with a hard weight in place of it."""
     count = [turns(run).sum() for run in runs]
-    way = [evidence.figure("choke_travel", run) for run in runs]
+    way = [evidence.figure("travel", run) for run in runs]
     cheap = _penalty(runs[2], FAR) / _penalty(runs[0], FAR)
     conditions = tuple(count[0] < count[i] and way[0] < way[i] for i in (1, 2))
     return Finding(conditions, {"count": count, "way": way, "cheap": 100 * cheap.min()})

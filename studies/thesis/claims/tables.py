@@ -7,8 +7,8 @@ import string
 from collections.abc import Sequence
 from pathlib import Path
 
+from studies.tables import csv_text, markdown_table
 from studies.thesis.claims.record import VERDICTS, Claim
-from studies.thesis.tables import csv_text, markdown_table
 
 HEAD = ("id", "section", "the thesis says", "measured", "holds if", "value", "verdict", "figures", "study")
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from studies.definition.presets import CHOKE, GAS, LIFT, OIL
 from studies.kpi.loop import closed_loop_cost
 from studies.thesis.claims.record import Run, index
+from studies.thesis.well import CHOKE, GAS, LIFT, OIL
 
 
 def slope(run: Run, deviation: np.ndarray) -> np.ndarray:

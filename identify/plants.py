@@ -1,0 +1,162 @@
+"""The plants and the model of a process: opened from where its file says they come from.
+
+A step-response model is its own plant, a JAX function and a Python class are imported, an FMU runs in a process of its own.
+Studies, the command line and the app open theirs here.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxmpc.process.file import process_digest
+from jaxmpc.process.model_plant import ModelPlant
+
+from identify.step_test import identify_step_response
+from jaxmpc.errors import InputError, near
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.process.actuator import Actuator
+from jaxmpc.process.plant import Parameter, disturbances_of
+from jaxmpc.process.process import PlantSource, Process
+
+
+def open_plant(
+    process: Process,
+    name: str = "",
+    *,
+    actual: bool = True,
+    parameters: Mapping[str, Any] | None = None,
+) -> Any:
+    """A plant of a process, at its working point.
+
+    Args:
+        name: of the plant; the first if not given.
+        actual: whether MVs move as their actuators do; otherwise they take every value within their limits.
+        parameters: that are not the plant's own, by name, in the units of its `parameter_table`.
+
+    Returns:
+        A `JaxPlant` or a stateful plant; one that has `close` is to be closed.
+
+    Raises:
+        InputError: for an unknown name, a module or function that is not there, and a plant that is not one of the process:
+            another sampling interval or other disturbances.
+    """
+    name = name or next(iter(process.plants))
+    if name not in process.plants:
+        raise InputError("plant", name, f"one of {', '.join(process.plants)}", near(name, process.plants))
+    source, path = process.plants[name], f"plants.{name}"
+    plant = _made(process, source, path, process.actuators(actual))
+    if abs(plant.dt - process.dt) > 1e-9 * process.dt:
+        raise InputError(
+            path, f"a sampling interval of {plant.dt:g} s", f"dt = {process.dt:g} s of the process"
+        )
+    own, wanted = disturbances_of(plant), process.disturbance_names
+    if wanted and own != wanted:
+        raise InputError(path, list(own), f"the disturbances of the process: {', '.join(wanted)}")
+    return plant.replaced(parameters) if parameters else plant
+
+
+def parameters_of(process: Process, name: str = "") -> tuple[Parameter, ...]:
+    """Parameters of a plant of a process that studies may vary."""
+    plant = open_plant(process, name)
+    try:
+        return tuple(getattr(plant, "parameter_table", ()))
+    finally:
+        if hasattr(plant, "close"):
+            plant.close()
+
+
+def plant_facts(process: Process, name: str, plant: Any) -> dict[str, Any]:
+    """JSON-like facts that identify a plant of a process, for hashes and provenance."""
+    source = process.plants[name or next(iter(process.plants))]
+    return {"kind": source.kind, "hash": getattr(plant, "token", None) or process_digest(process)}
+
+
+def _made(process: Process, source: PlantSource, path: str, actuators: Sequence[Actuator]) -> Any:
+    folder = Path(process.folder)
+    if source.kind == "model":
+        file = source.source or process.model.file
+        return ModelPlant(load_model(process, file), actuators=tuple(actuators), **source.options)
+    if source.kind == "fmu":
+        from identify.fmu import FmuPlant
+
+        return FmuPlant(folder / source.source, actuators=tuple(actuators), dt=process.dt, **source.options)
+    make = imported(source.source, folder, f"{path}.source")
+    return make(actuators=tuple(actuators), **source.options)
+
+
+def imported(source: str, folder: Path, path: str) -> Any:
+    """What ``module:name`` names; the module is installed, or a file in the folder of the process.
+
+    Raises:
+        InputError: if it is not there, at `path`.
+    """
+    module, _, name = source.partition(":")
+    try:
+        file = folder / f"{module}.py"
+        if file.is_file():
+            spec: Any = importlib.util.spec_from_file_location(f"jaxmpc_process_{module}", file)
+            found = importlib.util.module_from_spec(spec)
+            sys.modules[spec.name] = found  # so that what it defines can be sent to workers
+            spec.loader.exec_module(found)
+        else:
+            found = importlib.import_module(module)
+    except ImportError as error:
+        raise InputError(
+            path, source, f"a module that can be imported, or a file in {folder} ({error})"
+        ) from None
+    if not hasattr(found, name):
+        raise InputError(path, source, f"a name in {module}", near(name, vars(found)))
+    return getattr(found, name)
+
+
+def load_model(process: Process, file: str = "") -> StepResponseModel:
+    """The model file of a process, which has the CVs and MVs of the process in its order.
+
+    Raises:
+        InputError: naming the field that does not fit.
+    """
+    file = file or process.model.file
+    model = StepResponseModel.load(Path(process.folder) / file)
+    for key, names in (("cv", process.cv_names), ("mv", process.mv_names)):
+        found = getattr(model, f"{key}_names")
+        if found != names:
+            raise InputError(f"{file}: {key}", list(found), f"those of the process: {', '.join(names)}")
+    if abs(model.dt - process.dt) > 1e-9 * process.dt:
+        raise InputError(f"{file}: dt", model.dt, f"dt = {process.dt:g} s of the process")
+    return model
+
+
+def model_samples(process: Process) -> int:
+    """Coefficients of the model of a process."""
+    return load_model(process).samples if process.model.file else process.model.samples
+
+
+def model_of(
+    process: Process, plant: Any = None, working_point: Sequence[float] = (), samples: int | None = None
+) -> StepResponseModel:
+    """The step-response model of a process: its file, or a step test on its plant.
+
+    Args:
+        plant: for the step test; the first one of the process if not given.
+        working_point: of the step test, one value per MV [MV unit]; that of the process if not given.
+        samples: coefficients; those of the process if not given.
+
+    Raises:
+        InputError: for a working point from which the steps cannot be made.
+    """
+    if process.model.file:
+        return load_model(process)
+    at = [float(v) for v in working_point] or [process.model.working_point[name] for name in process.mv_names]
+    steps = [process.model.steps[name] for name in process.mv_names]
+    own = plant is None
+    plant = open_plant(process, actual=False) if own else plant
+    try:
+        return identify_step_response(plant, at, steps, samples or process.model.samples)
+    finally:
+        if own and hasattr(plant, "close"):
+            plant.close()

@@ -1,0 +1,120 @@
+"""Comparisons by name or file: the one for any process, those of the thesis (chapter 7), and a user's own.
+
+A comparison is a TOML file with ``[[controllers]]``: keys of `ControllerDefinition`, of which `kind` and `actuator` are those
+of mixed-integer MPC on the actual actuators unless given. ``reference`` names one of the process, or ``windows`` and
+``duration`` [s] give one. ``[quick]`` replaces keys in the shortened variant; its ``controllers`` name those that run.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from jaxmpc.decoding import decode
+from jaxmpc.errors import InputError, near
+from jaxmpc.process.file import load_process, windows_reference
+from jaxmpc.process.process import Process
+from studies.definition.comparison import ComparisonDefinition, ReferenceDefinition
+from studies.definition.refusing import require
+
+FOLDERS = "comparisons", "thesis/comparisons"
+INTEGER = {"kind": "mixed-integer", "actuator": "step"}  # of a controller that says nothing else
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Comparison:
+    """A comparison, checked, and the process that it is of."""
+
+    kind: str  # name of its file, by which figures and summaries know it
+    definition: ComparisonDefinition
+    process: Process
+
+
+def shipped_comparisons() -> dict[str, Path]:
+    """Files of the comparisons that come with the package, by name."""
+    root = Path(str(resources.files("studies")))
+    return {path.stem: path for folder in FOLDERS for path in sorted((root / folder).glob("*.toml"))}
+
+
+def is_comparison(name_or_path: str | Path) -> bool:
+    """Whether it is a shipped comparison, or a file that lists controllers."""
+    if str(name_or_path) in shipped_comparisons():
+        return True
+    try:
+        return "controllers" in tomllib.loads(Path(name_or_path).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return False
+
+
+def load_comparison(
+    name_or_path: str | Path, *, quick: bool = False, plant: str = "", process: str | Path = ""
+) -> Comparison:
+    """A shipped comparison by name, or a file by its path.
+
+    Args:
+        quick: the shortened variant.
+        plant: of the process; that of the file, or the first one, if not given.
+        process: name or file; that of the comparison if not given.
+
+    Raises:
+        InputError: naming the path of the field.
+    """
+    shipped = shipped_comparisons()
+    path = shipped.get(str(name_or_path)) or Path(name_or_path)
+    try:
+        told = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        expected = f"a comparison ({', '.join(shipped)}) or a file ({error.strerror or error})"
+        raise InputError("study", str(name_or_path), expected, near(name_or_path, shipped)) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError("study", str(path), f"a TOML file ({error})") from None
+    return _comparison(path, told, quick, plant, process)
+
+
+def _comparison(path: Path, told: dict[str, Any], quick: bool, plant: str, given: str | Path) -> Comparison:
+    of_file = told.pop("process", "")
+    require(
+        given or of_file,
+        "--process",
+        "nothing",
+        "a process file or a shipped process: this comparison names none",
+    )
+    if given and of_file and Path(path).stem in shipped_comparisons():
+        require(
+            str(given) == of_file, "--process", str(given), f"nothing, or {of_file}: this comparison is of it"
+        )
+    process = load_process(given) if given else load_process(of_file, path.parent)
+    plant = plant or told.get("plant", "") or next(iter(process.plants))
+    own = "" if of_file else f"{process.name}-"
+    name = f"{own}{told.pop('name', path.stem)}-{'quick-' if quick else ''}{plant}"
+    short, controllers = told.pop("quick", {}), told.get("controllers")
+    require(
+        isinstance(controllers, list) and controllers,
+        "controllers",
+        controllers,
+        "tables, each [[controllers]]",
+    )
+    runs = [INTEGER | one if isinstance(one, dict) else one for one in controllers]
+    if quick:
+        asked = short.get("controllers", [one["name"] for one in runs])
+        runs = [one for one in runs if one["name"] in asked]
+        told |= {"title": f"{told.get('title', path.stem)}, shortened", **short}
+    windows, duration, known = (told.pop(key, None) for key in ("windows", "duration", "reference"))
+    reference = windows_reference("", windows, duration, process.cvs) if windows else process.reference(known)
+    if not windows and duration is not None:
+        reference = reference.cut(duration)
+    told |= {
+        "name": name,
+        "process": process.name,
+        "plant": plant,
+        "controllers": runs,
+        "reference": msgspec.to_builtins(ReferenceDefinition.of(reference)),
+    }
+    definition = decode(told, ComparisonDefinition, name="comparison")
+    definition.check(process)
+    return Comparison(path.stem, definition, process)
