@@ -28,10 +28,12 @@ if not _os.environ.get("JAXMPC_NO_JIT_CACHE"):
 _watch()
 
 _HOME_OF = {
+    "Actuator": "process.actuator",
     "Controller": "controller.controller",
     "Controllers": "controller.controller",
     "InputError": "errors",
     "Reference": "process.reference",
+    "ModelPlant": "process.model_plant",
     "SensorFault": "controller.measurement",
     "SteadyMap": "steady.map",
     "StepResponseModel": "model.step_response",
