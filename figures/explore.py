@@ -22,9 +22,9 @@ from figures.sweep.wear import front
 from figures.thesis.plans import BEFORE, draw_plan
 from jaxmpc.errors import InputError
 from studies.kpi.evaluate import completed, key_figures
+from studies.plans import plan_at
 from studies.store.files import RESULTS
 from studies.store.reading import open_results
-from studies.plans import plan_at
 
 X, Y = "travel", "deviation"  # columns of `points`, [%] and [1]
 TITLES = {X: "choke travel [%]", Y: "mean deviation / thesis deadzone [1]"}

@@ -13,13 +13,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxmpc.process.file import process_digest
-from jaxmpc.process.model_plant import ModelPlant
+import numpy as np
 
 from identify.step_test import identify_step_response
 from jaxmpc.errors import InputError, near
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.actuator import Actuator
+from jaxmpc.process.file import process_digest
+from jaxmpc.process.model_plant import ModelPlant
 from jaxmpc.process.plant import Parameter, disturbances_of
 from jaxmpc.process.process import PlantSource, Process
 
@@ -43,7 +44,7 @@ def open_plant(
 
     Raises:
         InputError: for an unknown name, a module or function that is not there, and a plant that is not one of the process:
-            another sampling interval or other disturbances.
+            another sampling interval, or without its disturbances.
     """
     name = name or next(iter(process.plants))
     if name not in process.plants:
@@ -54,10 +55,21 @@ def open_plant(
         raise InputError(
             path, f"a sampling interval of {plant.dt:g} s", f"dt = {process.dt:g} s of the process"
         )
-    own, wanted = disturbances_of(plant), process.disturbance_names
-    if wanted and own != wanted:
-        raise InputError(path, list(own), f"the disturbances of the process: {', '.join(wanted)}")
+    own = disturbances_of(plant)
+    for i, name in enumerate(process.disturbance_names):
+        if name not in own:
+            raise InputError(
+                f"disturbance[{i}].name", name, f"a disturbance of {path}: {', '.join(own)}", near(name, own)
+            )
     return plant.replaced(parameters) if parameters else plant
+
+
+def disturbance_of(process: Process, plant: Any, given: np.ndarray) -> np.ndarray:
+    """Disturbances ``"... disturbance"`` of a process in the order of its plant; what else that has is 0."""
+    own = disturbances_of(plant)
+    out = np.zeros((*given.shape[:-1], len(own)))
+    out[..., [own.index(name) for name in process.disturbance_names]] = given
+    return out
 
 
 def parameters_of(process: Process, name: str = "") -> tuple[Parameter, ...]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from identify.plants import open_plant
+from identify.plants import disturbance_of, open_plant
 from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
 from jaxmpc.files import from_strict_json, write_atomically
@@ -106,12 +106,14 @@ def rerun(store: Path, number: int) -> Rerun:
     model = identify_models(process, [scenario.model_point])[scenario.model_point]
     # arrays: no program of its own for every scenario
     parameters = {name: np.float64(value) for name, value in scenario.plant.items()}
+    controlled = open_plant(process, plant, actual=scenario.actuator == "step", parameters=parameters)
+    offsets = scenario.disturbance
     trajectory = simulate(
         Controller(scenario.structure, scenario.tuning, model),
-        open_plant(process, plant, actual=scenario.actuator == "step", parameters=parameters),
+        controlled,
         scenario.reference,
         samples=scenario.samples,
-        disturbance=scenario.disturbance,
+        disturbance=None if offsets is None else disturbance_of(process, controlled, offsets),
         noise=scenario.noise,
         faults=scenario.faults,
         position_feedback=scenario.position_feedback,

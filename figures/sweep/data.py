@@ -17,9 +17,9 @@ import xarray as xr
 from figures import style
 from jaxmpc.errors import InputError
 from studies.definition.fields import FIELDS, as_text
-from studies.thesis.well import TUNINGS
 from studies.store.layout import FLAG
 from studies.store.reading import open_study, provenance
+from studies.thesis.well import TUNINGS
 
 CONTROLLER = ("controller", "actuator")
 STRUCTURE = ("blocking", "blocks", "prediction_horizon", "control_horizon")

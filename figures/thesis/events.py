@@ -13,8 +13,8 @@ from figures.figure import FigureEntry
 from figures.thesis import runs
 from figures.thesis.facts import between, settled
 from jaxmpc.errors import InputError
-from studies.thesis.well import CHOKE, GAS, LIFT, OIL
 from studies.store.reading import provenance
+from studies.thesis.well import CHOKE, GAS, LIFT, OIL
 
 INTEGER = "mixed-integer"
 When = Callable[[xr.Dataset, str], float]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from studies.thesis.well import CHOKE
 from studies.kpi import loop as kpi
+from studies.thesis.well import CHOKE
 
 LATE = 600.0  # s at the end of a stretch that stand for what it settles at
 

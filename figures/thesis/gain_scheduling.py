@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from figures import panels, style
 from figures.figure import FigureEntry
-from studies.thesis.well import CHOKE, GAS, OIL
 from studies.kpi.evaluate import key_figures
+from studies.thesis.well import CHOKE, GAS, OIL
 
 NEAR_CLOSED = 6500.0  # m3/h, gas setpoints below it need a choke of less than about 12 %
 PAIRS = {  # one model and schedule, in words

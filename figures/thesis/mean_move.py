@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 
 from figures import panels, style
 from figures.figure import FigureEntry
-from studies.thesis.well import CHOKE
 from studies.kpi import loop as kpi
 from studies.kpi.evaluate import key_figures
+from studies.thesis.well import CHOKE
 
 KINDS = ("continuous", "mixed-integer")
 MODES = {"reactive": style.VERMILLION, "predictive": style.BLUE}

@@ -16,9 +16,9 @@ from figures import panels, style
 from figures.figure import FigureEntry
 from figures.thesis.facts import between, turns
 from jaxmpc.errors import InputError
-from studies.thesis.well import CHOKE, GAS, LIFT, OIL
-from studies.thesis.reach import NEAR_CLOSED
 from studies.plans import StoredPlan, plan_at
+from studies.thesis.reach import NEAR_CLOSED
+from studies.thesis.well import CHOKE, GAS, LIFT, OIL
 
 BEFORE = 600.0  # s of the past to show
 MINUTE = 60.0

@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 
 from figures import panels, style
 from jaxmpc.errors import InputError
-from studies.thesis.well import CHOKE, GAS, LIFT, OIL
 from studies.store.reading import open_results, provenance
+from studies.thesis.well import CHOKE, GAS, LIFT, OIL
 
 PLAIN, TARGETED = "without-rto", "with-rto"
 CURVES = {

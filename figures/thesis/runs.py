@@ -14,9 +14,9 @@ from figures import panels, style
 from figures.figure import FigureEntry
 from figures.thesis.facts import between, choke_moves, reversals, times, turns
 from jaxmpc.errors import InputError
-from studies.thesis.well import CHOKE, GAS, LIFT, OIL
 from studies.kpi import loop as kpi
 from studies.thesis.reach import NEAR_CLOSED
+from studies.thesis.well import CHOKE, GAS, LIFT, OIL
 
 SMOOTH, ROUNDED, INTEGER, HARD = "continuous-choke", "step-choke", "mixed-integer", "no-soft"
 COMPARED = ("soft", HARD, "no-soft-plain")  # controllers with and without Soft MPC

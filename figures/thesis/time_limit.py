@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from figures import style
 from figures.figure import FigureEntry
 from jaxmpc.status import LIMIT
-from studies.thesis.well import OIL
 from studies.kpi.evaluate import key_figures
+from studies.thesis.well import OIL
 
 
 def draw(data: xr.Dataset) -> Figure:

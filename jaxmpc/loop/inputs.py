@@ -14,9 +14,9 @@ from jaxmpc.controller.controller import Batch
 from jaxmpc.errors import InputError
 from jaxmpc.loop.compiled import Inputs
 from jaxmpc.loop.noise import check_deviation, check_seed, errors_of
-from jaxmpc.process.reference import Reference
 from jaxmpc.problem.structure import Structure
 from jaxmpc.process.plant import JaxPlant, disturbances_of
+from jaxmpc.process.reference import Reference
 from jaxmpc.programs.lanes import Lanes, for_all
 
 

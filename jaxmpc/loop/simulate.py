@@ -20,11 +20,11 @@ from jaxmpc.loop.compiled import Inputs, simulate_compiled
 from jaxmpc.loop.host import simulate_on_host
 from jaxmpc.loop.inputs import Sweep
 from jaxmpc.loop.interventions import checked_changes, checked_sample
-from jaxmpc.process.reference import Reference
 from jaxmpc.loop.trajectory import RECORDABLE, Trajectory, TrajectoryBatch
 from jaxmpc.problem.structure import Structure
 from jaxmpc.process.host import HostPlant
 from jaxmpc.process.plant import JaxPlant, StatefulPlant
+from jaxmpc.process.reference import Reference
 from jaxmpc.programs.lanes import Lanes, for_all
 
 LANES = 256  # of a sweep that run side by side

@@ -9,11 +9,11 @@ import numpy as np
 
 from jaxmpc.controller.targets import TargetController
 from jaxmpc.errors import InputError
-from jaxmpc.process.reference import Reference
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.trajectory import AXES, Trajectory
 from jaxmpc.process.host import HostPlant
 from jaxmpc.process.plant import JaxPlant, disturbances_of
+from jaxmpc.process.reference import Reference
 
 
 def simulate_with_targets(

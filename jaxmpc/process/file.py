@@ -116,7 +116,7 @@ class ProcessFile(Section, frozen=True):
     title: str = ""
     source: str = ""
     disturbance: tuple[VariableSection, ...] = ()
-    plants: dict[str, PlantSection] = {"model": PlantSection("model")}
+    plants: dict[str, PlantSection] = msgspec.field(default_factory=lambda: {"model": PlantSection("model")})
     model: ModelSection = ModelSection()
     structure: dict[str, Any] = {}
     disturbances: dict[str, WindowsSection] = {}

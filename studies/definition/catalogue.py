@@ -1,7 +1,7 @@
 """Comparisons by name or file: the one for any process, those of the thesis (chapter 7), and a user's own.
 
-A comparison is a TOML file with ``[[controllers]]``: keys of `ControllerDefinition`, of which `kind` and `actuator` are those
-of mixed-integer MPC on the actual actuators unless given. ``reference`` names one of the process, or ``windows`` and
+A comparison is a TOML file with ``[[controllers]]``: keys of `ControllerDefinition`, whose `kind` and `actuator` are those of
+mixed-integer MPC on the actual actuators unless given. ``reference`` names one of the process, or ``windows`` and
 ``duration`` [s] give one. ``[quick]`` replaces keys in the shortened variant; its ``controllers`` name those that run.
 """
 
@@ -93,12 +93,8 @@ def _comparison(path: Path, told: dict[str, Any], quick: bool, plant: str, given
     own = "" if of_file else f"{process.name}-"
     name = f"{own}{told.pop('name', path.stem)}-{'quick-' if quick else ''}{plant}"
     short, controllers = told.pop("quick", {}), told.get("controllers")
-    require(
-        isinstance(controllers, list) and controllers,
-        "controllers",
-        controllers,
-        "tables, each [[controllers]]",
-    )
+    if not isinstance(controllers, list) or not controllers:
+        raise InputError("controllers", controllers, "one table or more, each headed [[controllers]]")
     runs = [INTEGER | one if isinstance(one, dict) else one for one in controllers]
     if quick:
         asked = short.get("controllers", [one["name"] for one in runs])

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from identify.plants import open_plant
+from identify.plants import disturbance_of, open_plant
 from jaxmpc.controller.controller import Controllers
 from jaxmpc.files import strict_json
 from jaxmpc.loop.simulate import simulate_batches
@@ -116,12 +116,15 @@ def run_scenarios(
         none = all(value is None for value in given)
         return None if none else np.stack([np.zeros(shape) if value is None else value for value in given])
 
+    plants = _plants(process, plant, filled, varying)
+    shared = plants.shared if isinstance(plants, Lanes) else plants
+    offsets = stacked("disturbance", first.samples, len(process.disturbances))
     batches = simulate_batches(
         controllers,
-        _plants(process, plant, filled, varying),
+        plants,
         references,
         samples=first.samples,
-        disturbance=stacked("disturbance", first.samples, len(process.disturbances)),
+        disturbance=None if offsets is None else disturbance_of(process, shared, offsets),
         noise=stacked("noise", cvs),
         seed=seeds,
         faults=stacked("faults", first.samples, cvs),

@@ -18,6 +18,7 @@ import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
+from identify.plants import disturbance_of
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.schedule import ModelSchedule, ScheduledController
 from jaxmpc.errors import InputError
@@ -171,7 +172,7 @@ def run_controller(
             controller(definition.build_tuning(process)),
             plant,
             comparison.reference.build(process),
-            disturbance=comparison.offsets(process),
+            disturbance=disturbance_of(process, plant, comparison.offsets(process)),
             position_feedback=definition.position_feedback,
             changes=[(at, controller(tuning)) for at, tuning in definition.later_tunings(process)],
             open_loop_from=definition.open_loop_from,

@@ -127,7 +127,7 @@ class _Runner:
     def run(self, batch: Study) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """As `chunk.run_scenarios`."""
         wanted = batch.model_points if self.models else (*self.study.probe.model_points, *batch.model_points)
-        new = identify_models(point for point in wanted if point not in self.models)
+        new = identify_models(batch.process, (point for point in wanted if point not in self.models))
         self.models |= {point: jax.tree.map(np.asarray, model) for point, model in new.items()}
         store = batch.definition.store
         return run_scenarios(
@@ -138,7 +138,9 @@ class _Runner:
             every=store.every,
             trajectories=store.trajectories,
             shared_model=self.shared_model,
-            plant_fields=self.plant,
+            process=batch.process,
+            plant=batch.definition.study.plant,
+            varying=self.plant,
         )
 
 

@@ -16,11 +16,11 @@ from jaxmpc.controller.plan import Planner
 from jaxmpc.errors import InputError
 from jaxmpc.integer.chain import chains_of
 from jaxmpc.integer.followed import followed
-from jaxmpc.process.reference import Reference
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.problem.blocking import sample_moves
 from jaxmpc.problem.layout import Size, layout_of
 from jaxmpc.problem.structure import Structure
+from jaxmpc.process.reference import Reference
 from jaxmpc.process.well.plant import WellPlant
 from tests import problems
 from tests.controller.test_plan import FINISHES, solve

@@ -9,9 +9,9 @@ import pytest
 from jaxmpc import status
 from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.errors import InputError
-from jaxmpc.process.reference import Reference
 from jaxmpc.loop.simulate import simulate, simulate_batch
 from jaxmpc.problem.tuning import make_tuning
+from jaxmpc.process.reference import Reference
 from jaxmpc.process.well.plant import WellPlant
 
 START = np.array([11000.0, 185.0]), np.array([50.0, 7500.0])

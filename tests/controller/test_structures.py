@@ -10,8 +10,8 @@ import pytest
 from jaxmpc import status
 from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.errors import InputError
-from jaxmpc.process.reference import Reference
 from jaxmpc.loop.simulate import simulate, simulate_batches
+from jaxmpc.process.reference import Reference
 from jaxmpc.process.well.plant import WellPlant
 from tests.five_controllers import START, tuned
 

@@ -13,12 +13,12 @@ from jaxmpc.controller.measurement import SensorFault, fault_errors
 from jaxmpc.controller.plan import Planner, solve_plan
 from jaxmpc.controller.targets import TargetController, augment
 from jaxmpc.errors import InputError
-from jaxmpc.process.reference import Reference
 from jaxmpc.loop.targets import simulate_with_targets
 from jaxmpc.model.step_response import make_model
 from jaxmpc.problem.blocking import sample_moves
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import make_tuning, stack_tunings
+from jaxmpc.process.reference import Reference
 from jaxmpc.process.well.plant import WellPlant
 
 CV, MV = np.array([11000.0, 185.0]), np.array([50.0, 7500.0])

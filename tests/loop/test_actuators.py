@@ -8,8 +8,8 @@ import pytest
 from identify.step_test import identify_step_response
 from jaxmpc import status
 from jaxmpc.controller.controller import Controller, Controllers
-from jaxmpc.process.reference import Reference
 from jaxmpc.loop.simulate import simulate, simulate_batch
+from jaxmpc.process.reference import Reference
 from jaxmpc.process.well.plant import WellPlant
 from studies.definition import presets
 

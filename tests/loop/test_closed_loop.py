@@ -17,9 +17,9 @@ from jaxmpc.controller.measurement import MISSING, OUTSIDE, SensorFault, fault_e
 from jaxmpc.errors import InputError
 from jaxmpc.loop.compiled import _Run
 from jaxmpc.loop.noise import noise_samples
-from jaxmpc.process.reference import Reference
 from jaxmpc.loop.simulate import simulate, simulate_batch, simulate_batches
 from jaxmpc.process.host import HostPlant
+from jaxmpc.process.reference import Reference
 from jaxmpc.process.well.equations import WellParameters
 from jaxmpc.process.well.plant import WellPlant
 from jaxmpc.programs.lanes import per_lane

@@ -8,9 +8,9 @@ from jaxmpc import status
 from jaxmpc.controller import measurement
 from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.loop import compiled
-from jaxmpc.process.reference import Reference
 from jaxmpc.loop.simulate import simulate, simulate_batch
 from jaxmpc.loop.trajectory import RECORDABLE
+from jaxmpc.process.reference import Reference
 from jaxmpc.process.well.plant import WellPlant
 from studies.definition import presets
 

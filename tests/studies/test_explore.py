@@ -18,11 +18,11 @@ from urllib.parse import urlsplit
 import jax
 import numpy as np
 import pytest
+from studies.definition.presets import CHOKE
 
 from figures import explore as draw
 from jaxmpc.cli import main as cli
 from jaxmpc.errors import InputError, MissingToolError
-from studies.definition.presets import CHOKE
 from studies.notebooks import launch
 from studies.notebooks import loop as explore
 from studies.notebooks.loop import RUN, Settings, main, run, shown_figures, written

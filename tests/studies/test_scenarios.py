@@ -12,8 +12,8 @@ from identify.step_test import identify_step_response
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.plan import Planner
 from jaxmpc.errors import InputError
-from jaxmpc.process.reference import Reference
 from jaxmpc.loop.simulate import simulate
+from jaxmpc.process.reference import Reference
 from jaxmpc.process.well.plant import WellPlant
 from studies.definition import comparison as definition
 from studies.definition import presets

@@ -9,6 +9,7 @@ parameters or disturbances is a `jax.vmap`. The closed loop and the identificati
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -21,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxmpc.check import as_floats, is_number
 from jaxmpc.errors import InputError
+from jaxmpc.process.actuator import Actuator
 from jaxmpc.process.plant import JaxPlant
 from jaxmpc.process.well.choke import CHOKES, LIFT, check_choke
 from jaxmpc.process.well.equations import (
@@ -277,6 +279,23 @@ class WellPlant(JaxPlant):
     def with_actuator(self, actuator: str) -> WellPlant:
         """The same well with another choke actuator."""
         return dataclasses.replace(self, actuator=actuator)
+
+
+def well_plant(actuators: Sequence[Actuator] = ()) -> WellPlant:
+    """The well of a process file, whose choke is continuous or moves in the steps of the thesis.
+
+    Raises:
+        InputError: for another actuator of the choke, or one of the lift that is not continuous.
+    """
+    choke, lift = actuators or (CHOKES["step"], Actuator())
+    known = [
+        name for name, one in CHOKES.items() if dataclasses.replace(choke, low=one.low, high=one.high) == one
+    ]
+    if not known:
+        raise InputError("mv[0].actuator", choke, "continuous, or the steps of 2 % with a threshold of 1.6 %")
+    if lift.kind != "continuous":
+        raise InputError("mv[1].actuator", lift.kind, "continuous")
+    return WellPlant(actuator=known[0])
 
 
 def check_inputs(choke, lift, disturbance=0.0) -> None:

@@ -23,6 +23,7 @@ from studies.run.runner import run_study
 from studies.store.layout import Column, StoreLayout
 from studies.store.reading import chunk_facts, kpi_frame
 from studies.store.writing import Store
+from studies.thesis.well import WELL
 
 CHUNK = 64
 QUIET: dict[str, Any] = {"progress": False, "say": lambda _: None}
@@ -65,7 +66,7 @@ def _opening(context: Context, folder: Path, count: int) -> Row:
     row = _row(
         f"key figures of {count} scenarios as a table", seconds, count, 2.0 if count >= 10_000 else None
     )
-    return _counted(row, (np.asarray(frame["choke_travel"]) == np.arange(count)).sum())
+    return _counted(row, (np.asarray(frame["travel.choke"]) == np.arange(count)).sum())
 
 
 def _resuming(context: Context, folder: Path, chunks: int) -> Row:
@@ -133,7 +134,7 @@ def _layout(count: int, size: int) -> StoreLayout:
         chunk_scenarios=tuple(everyone[i : i + size] for i in range(0, count, size)),
         scenario_hashes=tuple(str(k) for k in everyone),
         columns=(Column("seed", "seed", "1", everyone.astype(float)),),
-        variables=stored_variables(()),
+        variables=stored_variables(WELL, ()),
         coords={"cv": (["gas_rate", "oil_rate"], "", "CV"), "mv": (["choke", "gas_lift"], "", "MV")},
         provenance={},
     )
