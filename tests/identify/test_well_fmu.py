@@ -17,9 +17,10 @@ import pytest
 from fmpy.fmi2 import FMU2Slave
 from fmpy.fmi3 import FMU3Slave
 
-import identify.fmu as fmu_module
-from identify.fmu import FmuPlant, build_fmu, validate_fmu
-from identify.fmu_source import INPUT_SEQUENCE, fmu_files
+from identify import fmu_build
+from identify.fmu import validate_fmu
+from identify.well_fmu import WellFmuPlant, build_fmu
+from identify.well_fmu_source import INPUT_SEQUENCE, fmu_files
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.process.well.equations import SHIPPED_STEADY_STATE, WellParameters
 from jaxmpc.process.well.plant import WellPlant, WellState, steady_state_of
@@ -40,7 +41,7 @@ def path(request):
 
 @pytest.fixture
 def plant(path):
-    with FmuPlant(path) as plant:
+    with WellFmuPlant(path) as plant:
         yield plant
 
 
@@ -107,7 +108,7 @@ def test_step_choke_moves_alike_on_both_plants(path):
     demands = np.cumsum(np.random.default_rng(4).uniform(-1.5, 1.5, 200)) + 50.0
     mv = np.stack([demands, np.full(200, 7000.0)], axis=-1)
     _, expected = run_stepped(PLANT.init(), mv)
-    with FmuPlant(path, actuator="step") as plant:
+    with WellFmuPlant(path, actuator="step") as plant:
         positions = [plant.step(row).mv[0] for row in mv]
     np.testing.assert_array_equal(positions, expected.mv[:, 0])
     assert len(set(positions)) > 3
@@ -214,7 +215,7 @@ def test_2000_consecutive_runs_leak_nothing(plant):
             for mv in demands:
                 plant.step(mv)
         gc.collect()
-        return resident_bytes() + resident_bytes(plant._fmu._process.pid)
+        return resident_bytes() + resident_bytes(plant._process._process.pid)
 
     before = runs(200)
     assert runs(2000) - before < 2e6  # bytes: less than 1 kB per run
@@ -223,8 +224,8 @@ def test_2000_consecutive_runs_leak_nothing(plant):
 def test_loading_and_closing_leaves_neither_files_nor_processes_open(path):
     def load(count):
         for _ in range(count):
-            with FmuPlant(path) as plant:
-                folder = plant._fmu.folder
+            with WellFmuPlant(path) as plant:
+                folder = plant._process.folder
                 assert folder.is_dir()
             assert not folder.exists()
         gc.collect()
@@ -232,7 +233,7 @@ def test_loading_and_closing_leaves_neither_files_nor_processes_open(path):
 
     before = load(2)
     assert load(5) == before
-    with FmuPlant(path) as plant:
+    with WellFmuPlant(path) as plant:
         plant.close()
         with pytest.raises(InputError, match="closed"):
             plant.step([50.0, 7500.0])
@@ -244,7 +245,7 @@ def test_a_second_build_builds_nothing(path, monkeypatch, tmp_path):
     def refuse(*_):
         raise AssertionError("built again")
 
-    monkeypatch.setattr(fmu_module, "_compiled", refuse)
+    monkeypatch.setattr(fmu_build, "compiled", refuse)
     assert build_fmu(fmi) == path
     copy = build_fmu(fmi, tmp_path / "copy.fmu")
     assert copy.read_bytes() == path.read_bytes()
@@ -258,7 +259,7 @@ def test_a_damaged_fmu_in_the_cache_is_built_anew_and_named(monkeypatch, tmp_pat
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w") as zipped:
         zipped.writestr("modelDescription.xml", "<fmiModelDescription/>")
-    monkeypatch.setattr(fmu_module, "_compiled", lambda contents: archive.getvalue())
+    monkeypatch.setattr(fmu_build, "compiled", lambda contents: archive.getvalue())
     cached = build_fmu()
     sound = cached.read_bytes()
     assert zipfile.ZipFile(cached).testzip() is None
@@ -282,7 +283,7 @@ def test_a_damaged_fmu_in_the_cache_is_built_anew_and_named(monkeypatch, tmp_pat
 def test_an_fmu_of_other_parameters_starts_in_their_steady_state(path, monkeypatch, tmp_path):
     monkeypatch.setenv("JAXMPC_CACHE", str(tmp_path))
     parameters = WellParameters(reservoir_pressure=80e5)
-    with FmuPlant(build_fmu(2, tmp_path / "other.fmu", parameters)) as plant:
+    with WellFmuPlant(build_fmu(2, tmp_path / "other.fmu", parameters)) as plant:
         first = plant.measure().cv
         np.testing.assert_allclose(plant.step([50.0, 7500.0]).cv, first, rtol=1e-9)
         expected = steady_state_of(50.0, 7500.0, 0.0, parameters).outputs.cv
@@ -304,10 +305,10 @@ def test_a_c_compiler_and_the_python_package_of_cmake_are_enough(path, monkeypat
     tools = tmp_path / "bin"
     tools.mkdir()
     for tool in ("make", "ld", "as", "ar", "ranlib", "uname", "sh"):
-        found = fmu_module.shutil.which(tool)
+        found = fmu_build.shutil.which(tool)
         if found:
             (tools / tool).symlink_to(found)
-    compiler = fmu_module.shutil.which("gcc") or fmu_module.shutil.which("cc")
+    compiler = fmu_build.shutil.which("gcc") or fmu_build.shutil.which("cc")
     # A gcc without its C++ half, as on a machine where only gcc was installed.
     (tools / "gcc").write_text(
         f'#!/bin/sh\ncase "$*" in *.cpp*|*.cxx*) exit 1;; esac\nexec {compiler} "$@"\n'
@@ -320,14 +321,14 @@ def test_a_c_compiler_and_the_python_package_of_cmake_are_enough(path, monkeypat
     fmi = 3 if "fmi3" in path.name else 2
     built = build_fmu(fmi)
     assert validate_fmu(built) == []
-    with FmuPlant(built) as plant:
+    with WellFmuPlant(built) as plant:
         np.testing.assert_allclose(plant.measure().cv, [11012.70003, 185.004338], rtol=1e-8)
 
 
 @pytest.mark.slow
 def test_concurrent_builds_leave_one_sound_fmu(path, tmp_path):
     environment = {**os.environ, "JAXMPC_CACHE": str(tmp_path)}
-    code = "from identify.fmu import build_fmu; print(build_fmu())"
+    code = "from identify.well_fmu import build_fmu; print(build_fmu())"
     runs = [
         subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
         for _ in range(3)
@@ -366,10 +367,10 @@ def test_bad_input_is_refused_by_name_and_moves_nothing(plant, call, field):
         (lambda folder: build_fmu(2, folder), "out"),
         (lambda folder: build_fmu(2, folder / "well.zip"), "out"),
         (lambda folder: build_fmu(parameters=WellParameters(molar_mass=0.0)), "well.molar_mass"),
-        (lambda folder: FmuPlant(folder / "none.fmu"), "plant.path"),
-        (lambda folder: FmuPlant(folder / "text.fmu"), "plant.path"),
-        (lambda folder: FmuPlant(actuator="other"), "plant.actuator"),
-        (lambda folder: FmuPlant(dt=0.0), "plant.dt"),
+        (lambda folder: WellFmuPlant(folder / "none.fmu"), "plant.path"),
+        (lambda folder: WellFmuPlant(folder / "text.fmu"), "plant.path"),
+        (lambda folder: WellFmuPlant(actuator="other"), "plant.actuator"),
+        (lambda folder: WellFmuPlant(dt=0.0), "plant.dt"),
     ],
 )
 def test_bad_builds_and_files_are_refused_by_name(tmp_path, call, field):
