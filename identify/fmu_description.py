@@ -110,7 +110,7 @@ class FmuVariable:
         low, high = self.limits
         kind = "a whole number" if self.type in BITS else "a finite number"
         bounded = math.isfinite(low) or math.isfinite(high)
-        within = f" from {low:g} to {high:g}" if bounded else ""
+        within = f" from {low:.15g} to {high:.15g}" if bounded else ""
         return f"{kind}{within}{f' [{self.unit}]' if self.unit else ''}"
 
     @property
