@@ -3,7 +3,7 @@
 `WellPlant` integrates the equations of `jaxmpc.process.well.equations` with RK4 between samples, holds its inputs over each
 sample, and moves the choke the way its actuator does. Everything is pure: a batch over states, inputs,
 parameters or disturbances is a `jax.vmap`. The closed loop and the identification call it; the FMU plant of
-`identify.fmu` offers the same steps on the host.
+`identify.well_fmu` offers the same steps on the host.
 """
 
 from __future__ import annotations
