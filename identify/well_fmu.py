@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import platform
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,8 @@ from identify.fmu_process import TIME_LIMIT
 from identify.well_fmu_source import MODEL_IDENTIFIER, fmu_files
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
-from jaxmpc.process.well.choke import CHOKES, LIFT, check_choke
+from jaxmpc.process.actuator import Actuator
+from jaxmpc.process.well.choke import CHOKES, LIFT, check_choke, kind_of
 from jaxmpc.process.well.equations import (
     DEFAULT_CHOKE,
     DEFAULT_LIFT,
@@ -187,3 +189,8 @@ class WellFmuPlant(FmuPlant):
 
 def _floats(x) -> dict[str, float]:
     return {name: float(value) for name, value in zip(STATE_NAMES, x, strict=True)}
+
+
+def well_fmu(actuators: Sequence[Actuator] = ()) -> WellFmuPlant:
+    """The shipped well of a process file as an FMU, built on first use; errors of `jaxmpc.process.well.choke.kind_of`."""
+    return WellFmuPlant(actuator=kind_of(actuators))

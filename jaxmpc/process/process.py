@@ -1,8 +1,8 @@
 """A process: what a study needs to know beyond the controller, in one typed object and one TOML file.
 
 CVs, MVs with their actuators and disturbances by name and unit, plants, the model, the default structure, presets of
-tunings, references, disturbances over time and key figures. Study keys, key figures, figures, reports and the app follow from
-it. `jaxmpc.process.file` reads and writes the TOML; `jaxmpc.process.library` has the shipped processes.
+tunings, references, disturbances over time and key figures. Study keys, key figures, figures, reports and the app follow
+from it. `jaxmpc.process.file` reads the TOML; `jaxmpc.process.library` has the shipped processes.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from types import MappingProxyType
 
 from jaxmpc.errors import InputError
@@ -21,3 +23,19 @@ def check_choke(actuator: object, path: str = "actuator") -> str:
     if actuator not in CHOKES:
         raise InputError(path, actuator, f"one of {', '.join(CHOKES)}")
     return str(actuator)
+
+
+def kind_of(actuators: Sequence[Actuator] = ()) -> str:
+    """The key of `CHOKES` that the actuators of a process file mean, choke and lift; a step choke without any.
+
+    Raises:
+        InputError: for another actuator of the choke, or one of the lift that is not continuous.
+    """
+    choke, lift = actuators or (CHOKES["step"], LIFT)
+    for name, one in CHOKES.items():
+        if dataclasses.replace(choke, low=one.low, high=one.high) == one and lift.kind == "continuous":
+            return name
+    expected = (
+        "a choke that is continuous, or moves in steps of 2 % beyond 1.6 %, and a lift that is continuous"
+    )
+    raise InputError("mv.actuator", [choke, lift], expected)

@@ -24,7 +24,7 @@ from jaxmpc.check import as_floats, is_number
 from jaxmpc.errors import InputError
 from jaxmpc.process.actuator import Actuator
 from jaxmpc.process.plant import JaxPlant
-from jaxmpc.process.well.choke import CHOKES, LIFT, check_choke
+from jaxmpc.process.well.choke import CHOKES, LIFT, check_choke, kind_of
 from jaxmpc.process.well.equations import (
     DEFAULT_CHOKE,
     DEFAULT_LIFT,
@@ -282,20 +282,8 @@ class WellPlant(JaxPlant):
 
 
 def well_plant(actuators: Sequence[Actuator] = ()) -> WellPlant:
-    """The well of a process file, whose choke is continuous or moves in the steps of the thesis.
-
-    Raises:
-        InputError: for another actuator of the choke, or one of the lift that is not continuous.
-    """
-    choke, lift = actuators or (CHOKES["step"], Actuator())
-    known = [
-        name for name, one in CHOKES.items() if dataclasses.replace(choke, low=one.low, high=one.high) == one
-    ]
-    if not known:
-        raise InputError("mv[0].actuator", choke, "continuous, or the steps of 2 % with a threshold of 1.6 %")
-    if lift.kind != "continuous":
-        raise InputError("mv[1].actuator", lift.kind, "continuous")
-    return WellPlant(actuator=known[0])
+    """The well of a process file; errors of `jaxmpc.process.well.choke.kind_of`."""
+    return WellPlant(actuator=kind_of(actuators))
 
 
 def check_inputs(choke, lift, disturbance=0.0) -> None:
