@@ -27,7 +27,11 @@ def expand(
 
 
 def load_study(
-    name_or_path: str | Path, *, quick: bool = False, confirmed: bool = False
+    name_or_path: str | Path,
+    *,
+    quick: bool = False,
+    confirmed: bool = False,
+    process: str | Path | None = None,
 ) -> Study | SearchStudy:
     """Read a definition (`load_definition`) and expand it; arguments and errors as for `expand`.
 
@@ -35,5 +39,6 @@ def load_study(
         name_or_path: a shipped study or a file.
         quick: the quick version.
         confirmed: accept more scenarios than ``study.confirmation_limit``.
+        process: in place of that of the definition.
     """
-    return expand(load_definition(name_or_path), quick=quick, confirmed=confirmed)
+    return expand(load_definition(name_or_path, process), quick=quick, confirmed=confirmed)

@@ -15,7 +15,6 @@ from jaxmpc.cli.options import (
     EXITS,
     PLANTS,
     Options,
-    choice,
     command,
     complain,
     option,
@@ -24,10 +23,7 @@ from jaxmpc.cli.options import (
 from jaxmpc.errors import InputError, near
 from jaxmpc.files import check_folder
 
-COMPARISONS = (  # studies of a few controllers; the others are sweeps
-    *("thesis", "soft", "predictions", "fine-regulation", "disturbance", "without-soft", "unblocked"),
-    *("gain-scheduling", "mean-move", "time-limit", "rto", "claims"),
-)
+ALONE = "rto", "claims"  # studies of the thesis with a program of their own
 DASK = "scheduler of a dask.distributed cluster, such as tcp://host:8786"
 DRY_RUN = "say how many scenarios, chunks, bytes and minutes, and stop"
 STORE = option("store", "STORE", "the store of a sweep", Path)
@@ -44,51 +40,83 @@ SWEEP_OPTIONS = ("store", "workers", "dask", "dry_run", "yes")
     option("study", "STUDY", "name of a shipped study, or a definition FILE.toml", str),
     switch("--quick", "the shortened version"),
     option("--out", "DIR", "where results and figures go", Path("results")),
-    choice("--plant", PLANTS, "comparisons only: drive the FMU or its JAX twin (default: fmu)", default=None),
+    option("--process", "PROCESS", "process file or shipped process, where the study names none", str),
+    option(
+        "--plant", "NAME", "comparisons only: which plant of the process (default: that of the study)", str
+    ),
     option("--store", "PATH.zarr", "sweeps only: the store (default: DIR/NAME.zarr)", Path),
     option("--workers", "N", "sweeps only: processes (default: 1)", int),
     option("--dask", "ADDRESS", f"sweeps only: {DASK}", str),
     switch("--dry-run", f"sweeps only: {DRY_RUN}", default=None),
     switch("--yes", "sweeps only: run more scenarios than the confirmation limit of the study", default=None),
-    epilog=f"Comparisons: thesis (three controllers over 78,000 s), {', '.join(COMPARISONS[1:])}. "
-    "Sweeps: deadzone, mismatch, blocking, robustness, tune (a search). "
+    epilog="Comparisons: comparison (of any process, with --process), thesis (three controllers over 78,000 s), soft, "
+    "predictions, fine-regulation, disturbance, without-soft, unblocked, gain-scheduling, mean-move, time-limit, rto, "
+    "claims. Sweeps: deadzone, mismatch, blocking, robustness, tune (a search). "
     f"A run that is stopped goes on where it was when the same command is given again. {EXITS}",
 )
 def run(options: Options) -> int:
-    """Run a study: the thesis comparison, another shipped study, or a sweep of your own from a TOML file."""
-    if options.study in COMPARISONS:
+    """Run a study: the thesis comparison, that of your own process, another shipped study, or a sweep from a TOML file."""
+    from studies.definition.catalogue import is_comparison
+
+    if options.study in ALONE or is_comparison(options.study):
         for name in SWEEP_OPTIONS:
             if (value := getattr(options, name)) is not None:
                 expected = f"a sweep study; {options.study} runs in one process"
                 raise InputError(f"--{name.replace('_', '-')}", value, expected)
-        return _study_comparison(options)
+        return _study_alone(options) if options.study in ALONE else _study_comparison(options)
     if options.plant is not None:
-        raise InputError("--plant", options.plant, "a comparison such as thesis; sweeps run on the JAX well")
+        raise InputError(
+            "--plant", options.plant, "a comparison such as thesis; a sweep names its plant in [study]"
+        )
     return _study_sweep(options)
 
 
-def _study_comparison(options: Options) -> int:
+def _study_alone(options: Options) -> int:
     check_folder("--out", options.out)
+    if options.process is not None:
+        raise InputError(
+            "--process", options.process, f"nothing: {options.study} is of the well of the thesis"
+        )
     asked = options.out, options.quick, options.plant or PLANTS[0]
     if options.study == "claims":
         from studies.thesis.claims_study import run_claims
 
         print(f"Claims: {run_claims(*asked) / 'claims.html'}")
         return EXIT_OPTIMAL
-    if options.study == "rto":
-        from figures.thesis.rto import draw_all as draw_rto
-        from studies.thesis.rto import run_rto
+    from figures.thesis.rto import draw_all as draw_rto
+    from studies.thesis.rto import run_rto
 
-        folder = run_rto(*asked)
-        draw_rto(folder)
-    else:
-        from figures.registry import draw_study
-        from studies.thesis.catalogue import run_named
-        from studies.thesis.report import write_summary
+    folder = run_rto(*asked)
+    draw_rto(folder)
+    print(f"Summary: {folder / 'summary.md'}, figures: {folder / 'figures'}")
+    return EXIT_OPTIMAL
 
-        folder = run_named(options.study, *asked)
+
+def _study_comparison(options: Options) -> int:
+    check_folder("--out", options.out)
+    from figures.registry import draw_study
+    from studies.definition.catalogue import load_comparison
+    from studies.thesis import catalogue
+
+    if options.study in catalogue.STUDIES:
+        from studies.thesis.report import write_thesis_summary
+
+        if options.process is not None:
+            raise InputError(
+                "--process", options.process, f"nothing: {options.study} is of the well of the thesis"
+            )
+        folder = catalogue.run_thesis(options.study, options.out, options.quick, options.plant or PLANTS[0])
         draw_study(folder, options.study)
-        write_summary(folder, options.study)
+        write_thesis_summary(folder, options.study)
+    else:
+        from studies.report import write_summary
+        from studies.run.named import run_named
+
+        given = dict(quick=options.quick, plant=options.plant or "", process=options.process or "")
+        comparison = load_comparison(options.study, **given)
+        folder = run_named(comparison, options.out)
+        draw_study(folder, "comparison")
+        write_summary(folder)
     print(f"Summary: {folder / 'summary.md'}, figures: {folder / 'figures'}")
     return EXIT_OPTIMAL
 
@@ -98,7 +126,7 @@ def _study_sweep(options: Options) -> int:
 
     confirmed = bool(options.dry_run or options.yes)
     try:
-        study = load_study(options.study, quick=options.quick, confirmed=confirmed)
+        study = load_study(options.study, quick=options.quick, confirmed=confirmed, process=options.process)
     except InputError as error:
         raise _refused(error, options.study) from None
     store = options.out / f"{study.name}.zarr" if options.store is None else options.store
@@ -129,15 +157,17 @@ def _study_sweep(options: Options) -> int:
 
 def _refused(error: InputError, study: str) -> InputError:
     """The error of a definition with what the command line can do about it."""
+    from studies.definition.catalogue import shipped_comparisons
     from studies.definition.sweep import shipped_studies
 
     if error.field == "study.confirmation_limit":
         hint = "Give --yes to run them all, --dry-run to see how long that takes"
         return InputError(error.field, error.value, error.expected, hint)
     if error.field == "study" and not os.path.exists(study):
-        sweeps, comparisons = ", ".join(shipped_studies()), ", ".join(COMPARISONS)
+        known = [*shipped_comparisons(), *ALONE]
+        sweeps, comparisons = ", ".join(shipped_studies()), ", ".join(known)
         expected = f"a comparison ({comparisons}), a sweep ({sweeps}), or a definition file that exists"
-        return InputError("study", study, expected, near(study, [*COMPARISONS, *shipped_studies()]))
+        return InputError("study", study, expected, near(study, [*known, *shipped_studies()]))
     return error
 
 
@@ -159,7 +189,8 @@ def _again(options: Options) -> str:
     from studies.definition.sweep import shipped_studies
 
     name = options.study if options.study in shipped_studies() else str(Path(options.study).resolve())
-    return shlex.quote(name) + bool(options.quick) * " --quick" + bool(options.yes) * " --yes"
+    own = f" --process {shlex.quote(str(options.process))}" if options.process else ""
+    return shlex.quote(name) + own + bool(options.quick) * " --quick" + bool(options.yes) * " --yes"
 
 
 @command("study status", STORE, switch("--verify", "read every file and compare checksums"))

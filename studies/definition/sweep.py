@@ -22,7 +22,7 @@ from identify.plants import parameters_of
 from jaxmpc.controller.measurement import FAULTS
 from jaxmpc.decoding import decode
 from jaxmpc.errors import InputError, near
-from jaxmpc.process.file import load_process
+from jaxmpc.process.file import load_process, shipped_processes
 from jaxmpc.process.process import Process
 from studies.definition.fields import Field, find, study_fields
 from studies.definition.refusing import require
@@ -160,8 +160,11 @@ class StudyDefinition:
         )
 
 
-def load_definition(name_or_path: str | Path) -> StudyDefinition:
+def load_definition(name_or_path: str | Path, process: str | Path | None = None) -> StudyDefinition:
     """Read a shipped definition by name (see `shipped_studies`), or any file by its path.
+
+    Args:
+        process: a process file (from here) or a shipped process, in place of that of the definition.
 
     Raises:
         InputError: for an unknown name, a file that cannot be read, text that is not TOML, and what `from_dict` refuses.
@@ -175,6 +178,9 @@ def load_definition(name_or_path: str | Path) -> StudyDefinition:
         raise InputError("study", str(name_or_path), expected, near(name_or_path, shipped)) from None
     except (ValueError, RecursionError) as error:
         raise InputError("study", str(path), f"a TOML file ({error})") from None
+    if process is not None and isinstance(body.get("study"), dict):
+        own = str(process) if str(process) in shipped_processes() else str(Path(process).resolve())
+        body["study"] = body["study"] | {"process": own}
     return StudyDefinition.from_dict(body, path.parent)
 
 

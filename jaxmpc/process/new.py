@@ -1,0 +1,236 @@
+"""A first process file from a step-response model: what the model does not say is guessed, and every guess says so.
+
+`jaxmpc process new` calls it. The guesses follow one idea: an MV typically moves over a quarter of its range, the span of a
+CV is what that does to it, and a deviation of one span costs as much as ten of the largest moves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from jaxmpc.errors import InputError, near
+from jaxmpc.model.step_response import StepResponseModel
+
+SETTLED = 0.02  # of the largest value of a response: within it, it has settled
+LEAST_HORIZON = 20  # samples
+LONGEST_BLOCK = 64  # samples
+
+
+def new_process(
+    model: StepResponseModel,
+    file: str,
+    name: str,
+    *,
+    steps: Mapping[str, float] | None = None,
+    switches: Sequence[str] = (),
+) -> tuple[str, list[str]]:
+    """The text of a process file for a model, and what was guessed for it.
+
+    Args:
+        model: of the process, which is its own plant until there is a better one.
+        file: of the model, as the process file names it.
+        name: of the process.
+        steps: sizes of the steps of MVs that do not take every value [MV unit].
+        switches: MVs that are on or off.
+
+    Returns:
+        ``(text, guesses)``.
+
+    Raises:
+        InputError: for MVs that the model has not, or steps that are not positive.
+    """
+    steps = dict(steps or {})
+    for mv in (*steps, *switches):
+        if mv not in model.mv_names:
+            raise InputError(
+                "--step", mv, f"an MV of the model: {', '.join(model.mv_names)}", near(mv, model.mv_names)
+            )
+    for mv, step in steps.items():
+        if not 0 < step < math.inf:
+            raise InputError("--step", f"{mv}={step:g}", "a positive step [MV unit]")
+    point = dict(model.working_point)
+    cv_units, mv_units = (units or ("1",) * len(names) for units, names in _names(model))
+    ranges = {
+        mv: _range(unit, point.get(mv), mv in switches)
+        for mv, unit in zip(model.mv_names, mv_units, strict=True)
+    }
+    spans = np.array([(high - low) / 4 for low, high in ranges.values()])
+    gains = np.asarray(model.coefficients)[:, :, -1]
+    reach = np.abs(gains) @ spans
+    cv_spans = [_round(value) if value > 0 else 1.0 for value in reach]
+    horizon, control = _horizons(model)
+    guesses = [
+        f"the range of {mv}: {low:g} to {high:g} {unit}, and at most {_move(low, high, steps.get(mv)):g} per sample"
+        for (mv, (low, high)), unit in zip(ranges.items(), mv_units, strict=True)
+    ]
+    guesses += [
+        f"the span of {cv}: {span:g} {unit}, by what the MVs do to it"
+        for cv, span, unit in zip(model.cv_names, cv_spans, cv_units, strict=True)
+    ]
+    guesses.append(f"horizons of {horizon} and {control} samples, by how long the responses take")
+    guesses.append("all weights, deadzones and setpoints")
+    lines = _head(model, file, name)
+    for cv, unit, span in zip(model.cv_names, cv_units, cv_spans, strict=True):
+        lines += [
+            "[[cv]]",
+            *_variable(cv, unit, span, "guessed from the gains and the ranges of the MVs"),
+            "",
+        ]
+    for mv, unit, span in zip(model.mv_names, mv_units, spans.tolist(), strict=True):
+        low, high = ranges[mv]
+        lines += ["[[mv]]", *_variable(mv, unit, span, "guessed: a quarter of its range")]
+        lines += [f"low = {low:g} # guessed", f"high = {high:g} # guessed"]
+        if mv in switches:
+            lines += ['actuator = { kind = "on-off" } # stands at low or at high']
+        elif mv in steps:
+            lines += [f"move = {_move(low, high, steps[mv]):g} # guessed: largest move per sample"]
+            lines += [f'actuator = {{ kind = "stepped", step = {steps[mv]:g} }}']
+        else:
+            lines += [f"move = {_move(low, high, None):g} # guessed: largest move per sample"]
+        lines.append("")
+    for dv, unit in zip(model.dv_names, model.dv_units or ("1",) * len(model.dv_names), strict=True):
+        lines += [
+            "[[disturbance]] # measured: the model has responses to it",
+            *_variable(dv, unit, 1.0, "guessed"),
+            "",
+        ]
+    for cv, unit, span in zip(model.cv_names, cv_units, cv_spans, strict=True):
+        lines += ["[[disturbance]] # not measured: added to the CV"]
+        lines += [
+            f'name = "output.{cv}"',
+            f"unit = {_text(unit)}",
+            f'label = "load on {cv.replace("_", " ")}"',
+        ]
+        lines += [f"span = {_round(span / 5):g}", ""]
+    lines += _tuning(
+        model, cv_spans, [_move(*ranges[mv], steps.get(mv)) for mv in model.mv_names], horizon, control
+    )
+    lines += _references(model, cv_spans, point, horizon)
+    return "\n".join(lines), guesses
+
+
+def _names(model: StepResponseModel) -> tuple[tuple[tuple[str, ...], tuple[str, ...]], ...]:
+    return (model.cv_units, model.cv_names), (model.mv_units, model.mv_names)
+
+
+def _text(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def _round(value: float, digits: int = 2) -> float:
+    """A number of few digits, which a person would have chosen."""
+    return float(f"{value:.{digits}g}")
+
+
+def _range(unit: str, point: float | None, switch: bool) -> tuple[float, float]:
+    """Low and high limit of an MV."""
+    if switch:
+        return 0.0, 1.0
+    if unit == "%":
+        return 0.0, 100.0
+    if point:
+        return tuple(sorted((0.0, _round(2 * point))))  # type: ignore[return-value]
+    return -10.0, 10.0
+
+
+def _move(low: float, high: float, step: float | None) -> float:
+    """Largest move per sample: one step, or a fiftieth of the range."""
+    return step or _round((high - low) / 50)
+
+
+def _horizons(model: StepResponseModel) -> tuple[int, int]:
+    """Prediction and control horizon [samples]: until all responses have settled, and four fifths of that."""
+    s = np.asarray(model.coefficients)
+    off = np.abs(s - s[:, :, -1:]) > SETTLED * np.abs(s).max(axis=2, keepdims=True)
+    last = int(np.flatnonzero(off.any(axis=(0, 1)))[-1]) + 2 if off.any() else 1
+    horizon = max(min(round(1.2 * last), model.samples), LEAST_HORIZON)
+    return horizon, max(4 * horizon // 5, 1)
+
+
+def blocks_of(horizon: int) -> list[int]:
+    """Blocks that sum to a control horizon: single samples first, then longer and longer ones."""
+    out, size = [], 1
+    while sum(out) < horizon:
+        for _ in range(4 if size == 1 else 2):
+            if sum(out) < horizon:
+                out.append(min(size, horizon - sum(out)))
+        size = min(2 * size, LONGEST_BLOCK)
+    return out
+
+
+def _head(model: StepResponseModel, file: str, name: str) -> list[str]:
+    return [
+        "# A process for studies of MPC with discrete actuators. What is guessed says so: look at it first.",
+        "# `jaxmpc process check` judges this file and draws the responses.",
+        "",
+        f"name = {_text(name)}",
+        f"dt = {model.dt:g} # s, that of the model",
+        "",
+        "[model]",
+        f"file = {_text(file)}",
+        "",
+        "[plants.model] # the model is its own plant; studies may vary gains, dead times and time scales of it",
+        'kind = "model"',
+        "",
+    ]
+
+
+def _variable(name: str, unit: str, span: float, why: str) -> list[str]:
+    return [f"name = {_text(name)}", f"unit = {_text(unit)}", f"span = {span:g} # {why}"]
+
+
+def _table(names: Sequence[str], values: Sequence[float]) -> str:
+    return "{ " + ", ".join(f"{_text(n)} = {v:g}" for n, v in zip(names, values, strict=True)) + " }"
+
+
+def _tuning(
+    model: StepResponseModel, spans: Sequence[float], moves: Sequence[float], horizon: int, control: int
+) -> list[str]:
+    cvs, mvs = model.cv_names, model.mv_names
+    weights = [_round(1 / span**2) for span in spans]
+    return [
+        "[structure]",
+        f"prediction_horizon = {horizon} # samples; guessed: until all responses have settled",
+        f"control_horizon = {control} # samples; guessed",
+        f"blocks = {blocks_of(control)} # samples; they sum to the control horizon",
+        "",
+        "[presets.default] # guessed: a deviation of one span costs as much as ten of the largest moves",
+        f"cv_weight = {_table(cvs, weights)} # 1/CV unit^2",
+        f"move_weight = {_table(mvs, [_round(0.1 / move**2) for move in moves])} # 1/MV unit^2",
+        f"deadzone = {_table(cvs, [_round(span / 50) for span in spans])} # CV unit, half widths",
+        f"soft_quadratic = {_table(cvs, weights)} # beyond the deadzone",
+        f"soft_linear = {_table(cvs, [0.0] * len(cvs))}",
+        f"bias_cutoff = {_round(1 / (2 * model.dt)):g} # rad/s, guessed",
+        "",
+    ]
+
+
+def _references(
+    model: StepResponseModel, spans: Sequence[float], point: Mapping[str, float], horizon: int
+) -> list[str]:
+    """Steps of one setpoint after the other, a quarter of a span each."""
+    start = [point.get(cv, 0.0) for cv in model.cv_names]
+    rows, at, wait = [list(start)], list(start), math.ceil(1.2 * horizon) * model.dt
+    for i, span in enumerate(spans):
+        at[i] += _round(span / 4)
+        rows.append(list(at))
+    rows.append(list(start))
+
+    def windows(rows: Sequence[Sequence[float]]) -> str:
+        listed = [[k * wait + (k > 0) * 0.0, *row] for k, row in enumerate(rows)]
+        return "[" + ", ".join("[" + ", ".join(f"{v:.10g}" for v in row) + "]" for row in listed) + "]"
+
+    listed = ", ".join(model.cv_names)
+    return [
+        f"[references.steps] # guessed; rows: start [s], then setpoints of {listed}",
+        f"duration = {len(rows) * wait:g} # s",
+        f"windows = {windows(rows)}",
+        "",
+        "[references.quick]",
+        f"duration = {2 * wait:g}",
+        f"windows = {windows(rows[:2])}",
+        "",
+    ]
