@@ -178,7 +178,7 @@ def model_of(
     own = plant is None
     plant = open_plant(process, actual=False) if own else plant
     try:
-        return identify_step_response(plant, at, steps, samples or process.model.samples)
+        return identify_step_response(plant, *at, tuple(steps), samples or process.model.samples)  # type: ignore
     finally:
         if own and hasattr(plant, "close"):
             plant.close()

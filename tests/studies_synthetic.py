@@ -15,10 +15,10 @@ from studies.store.layout import StoreLayout
 from studies.store.reading import open_results
 from studies.store.trajectories import run_fields
 from studies.store.writing import Store
-from studies.thesis.catalogue import STUDIES
+from studies.thesis import catalogue
 
 DT = 10.0
-CONTROLLERS = STUDIES["thesis"](False, "jax").controllers
+CONTROLLERS = catalogue.comparison_of("thesis", False, "jax").definition.controllers
 REFERENCE = ReferenceDefinition((0.0, 2000.0), ((10_000.0, 150.0), (30_000.0, 300.0)), 4000.0)
 
 

@@ -1,8 +1,8 @@
 """Comparisons by name or file: the one for any process, those of the thesis (chapter 7), and a user's own.
 
-A comparison is a TOML file with ``[[controllers]]``: keys of `ControllerDefinition`, which is mixed-integer MPC on the actual
-actuators unless they say otherwise. ``reference`` names one of the process, or ``windows`` and
-``duration`` [s] give one. ``[quick]`` replaces keys in the shortened variant; its ``controllers`` name those that run.
+A comparison is a TOML file with ``[[controllers]]``: keys of `ControllerDefinition`, mixed-integer MPC on the actual
+actuators unless they say otherwise. ``reference`` names one of the process, or ``windows`` and ``duration`` [s] give one.
+``[quick]`` replaces keys in the shortened variant; its ``controllers`` name those that run.
 """
 
 from __future__ import annotations

@@ -9,8 +9,8 @@ import pytest
 from jaxmpc.problem.declared import declared
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
-from studies.definition import presets
 from studies.definition.fields import FIELDS
+from studies.thesis.well import WELL
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 TABLE = re.compile(r"(?:^\|.*\n)+", re.MULTILINE)
@@ -46,8 +46,8 @@ def fields_of(kind) -> str:
 
 def keys_of_studies() -> str:
     """Every key below ``[base.tuning]``, with the default of the thesis preset."""
-    structure = presets.structure(integer=True)
-    tuning, rows = presets.tuning(structure), []
+    structure = WELL.structure(integer=True)
+    tuning, rows = WELL.tuning(structure), []
     for key, field in FIELDS.items():
         _, name, *of = key.split(".") if key.startswith("tuning.") else ("", "")
         if name:

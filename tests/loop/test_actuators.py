@@ -11,7 +11,7 @@ from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.loop.simulate import simulate, simulate_batch
 from jaxmpc.process.reference import Reference
 from jaxmpc.process.well.plant import WellPlant
-from studies.definition import presets
+from studies.thesis.well import WELL
 
 SAMPLES, DWELL = 70, 4
 LISTED = (10.0, 30.0, 40.0, 46.0, 50.0, 52.0, 60.0, 80.0)
@@ -25,7 +25,7 @@ def model():
 
 
 def structure_of(values=LISTED, dwell=DWELL):
-    base = presets.structure("inputs", integer=True)
+    base = WELL.structure("inputs", integer=True)
     given = dict(integer_step=(), integer_values=(values, None)) if values else {}
     return dataclasses.replace(base, **given, dwell=(dwell, 1))
 
@@ -36,7 +36,7 @@ def tuning_of(structure, weight=5.0):
         "move_high": {"choke": 20.0, "gas_lift": 200.0},
     }
     changes = {"move_weight": {"choke": weight, "gas_lift": 0.2}, "oscillation_rows": {"choke": False}}
-    return presets.tuning(structure, changes=changes | limits)
+    return WELL.tuning(structure, changes=changes | limits)
 
 
 def controller(model, structure, **options):
@@ -82,10 +82,10 @@ def test_an_evenly_spaced_list_closes_the_loop_of_its_step_in_compiled_calls(mod
     stepped = structure_of(None, 1)
     even = structure_of(tuple(np.arange(10.0, 91.0, 2.0)), 1)
     limits = {"mv_low": {"choke": 10.0, "gas_lift": 0.0}, "mv_high": {"choke": 90.0, "gas_lift": 10000.0}}
-    tuning = presets.tuning(stepped, changes=limits)
+    tuning = WELL.tuning(stepped, changes=limits)
     runs = [
         simulate(Controller(structure, own, model), PLANT, REFERENCE)
-        for structure, own in ((stepped, tuning), (even, presets.tuning(even)))
+        for structure, own in ((stepped, tuning), (even, WELL.tuning(even)))
     ]
     for field in ("mv_demand", "cv", "objective", "nodes", "finished_by"):
         np.testing.assert_array_equal(getattr(runs[0], field), getattr(runs[1], field), err_msg=field)

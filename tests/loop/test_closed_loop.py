@@ -23,7 +23,7 @@ from jaxmpc.process.reference import Reference
 from jaxmpc.process.well.equations import WellParameters
 from jaxmpc.process.well.plant import WellPlant
 from jaxmpc.programs.lanes import per_lane
-from studies.definition import presets
+from studies.thesis.well import WELL
 
 TO_30_PERCENT = Reference([0.0, 200.0], [[11013.0, 185.0], [12600.0, 175.0]], 1200.0)
 
@@ -34,8 +34,8 @@ def model():
 
 
 def controller_of(kind, model):
-    structure = presets.structure(integer=kind == "mixed-integer")
-    return Controller(structure, presets.tuning(structure), model)
+    structure = WELL.structure(integer=kind == "mixed-integer")
+    return Controller(structure, WELL.tuning(structure), model)
 
 
 @pytest.mark.skipif(
@@ -100,9 +100,9 @@ LIMITS = dict(
 
 @pytest.fixture(scope="module")
 def singles(model):
-    structure = presets.structure()
+    structure = WELL.structure()
     tunings = [
-        presets.tuning(structure, changes={"move_weight": {"choke": w, "gas_lift": 0.2}}) for w in WEIGHTS
+        WELL.tuning(structure, changes={"move_weight": {"choke": w, "gas_lift": 0.2}}) for w in WEIGHTS
     ]
     return [Controller(structure, tuning, model) for tuning in tunings]
 
@@ -240,10 +240,10 @@ import numpy as np
 from jaxmpc import Reference, StepResponseModel, WellPlant
 from jaxmpc.controller.controller import Controllers
 from jaxmpc.loop.simulate import simulate_batches
-from studies.definition import presets
+from studies.thesis.well import WELL
 assert jax.device_count() == 2
-structure = presets.structure()
-tunings = [presets.tuning(structure, changes={"move_weight": {"choke": w, "gas_lift": 0.2}}) for w in WEIGHTS]
+structure = WELL.structure()
+tunings = [WELL.tuning(structure, changes={"move_weight": {"choke": w, "gas_lift": 0.2}}) for w in WEIGHTS]
 lanes = Controllers(structure, tunings, StepResponseModel.load(sys.argv[1]))
 reference = Reference([0.0, 200.0], [[11013.0, 185.0], [12600.0, 175.0]], 1200.0)
 (batch,) = simulate_batches(lanes, WellPlant(), reference, samples=25, noise=[40.0, 0.5])
@@ -318,12 +318,12 @@ class OnTheHost:
 
 
 def test_faults_of_sensors_and_told_positions_are_the_same_in_compiled_loops_and_on_the_host(model):
-    structure = presets.structure()
+    structure = WELL.structure()
     changes = {
         "measurement_low": {"gas_rate": None, "oil_rate": 20.0},
         "bad_limit": {"gas_rate": 5, "oil_rate": None},
     }
-    controller = Controller(structure, presets.tuning(structure, changes=changes), model)
+    controller = Controller(structure, WELL.tuning(structure, changes=changes), model)
     faults = [
         SensorFault("gas_rate", "missing", 100.0, 100.0),
         SensorFault("oil_rate", "frozen", 300.0, 150.0),

@@ -12,7 +12,7 @@ from jaxmpc.loop.simulate import simulate, simulate_batch
 from jaxmpc.loop.trajectory import RECORDABLE
 from jaxmpc.process.reference import Reference
 from jaxmpc.process.well.plant import WellPlant
-from studies.definition import presets
+from studies.thesis.well import WELL
 
 SAMPLES = 90  # more than one call of the longest length
 PLANT = WellPlant(actuator="step")
@@ -25,8 +25,8 @@ def model():
 
 
 def controller(model, blocking="moves", preset="thesis", **options):
-    structure = presets.structure(blocking, integer=True)
-    tuning = presets.tuning(structure, preset, {"measurement_low": {"gas_rate": None, "oil_rate": 20.0}})
+    structure = WELL.structure(blocking, integer=True)
+    tuning = WELL.tuning(structure, preset, {"measurement_low": {"gas_rate": None, "oil_rate": 20.0}})
     return Controller(structure, tuning, model, **options)
 
 
@@ -103,10 +103,10 @@ def test_a_controller_whose_finish_is_prescribed_searches_by_it_alone(monkeypatc
 @pytest.mark.slow
 def test_many_loops_do_not_depend_on_how_many_threads_and_parts_there_are(monkeypatch, model):
     """Three parts of two, the last filled up, by one thread and by three; and each loop alone."""
-    structure = presets.structure("moves", integer=True)
+    structure = WELL.structure("moves", integer=True)
     weights = [150.0, 600.0, 300.0, 2000.0, 80.0]
     tunings = [
-        presets.tuning(structure, changes={"move_weight": {"choke": w, "gas_lift": 0.2}}) for w in weights
+        WELL.tuning(structure, changes={"move_weight": {"choke": w, "gas_lift": 0.2}}) for w in weights
     ]
     monkeypatch.setattr(compiled, "TOGETHER", 2)
     runs, seen = {}, []
@@ -132,8 +132,8 @@ def test_many_loops_do_not_depend_on_how_many_threads_and_parts_there_are(monkey
 def test_what_one_thread_raises_ends_all(monkeypatch, model):
     monkeypatch.setattr(compiled, "TOGETHER", 1)
     monkeypatch.setenv("JAXMPC_THREADS", "2")
-    structure = presets.structure("moves", integer=True)
-    controllers = Controllers(structure, [presets.tuning(structure)], [model], count=2)
+    structure = WELL.structure("moves", integer=True)
+    controllers = Controllers(structure, [WELL.tuning(structure)], [model], count=2)
 
     def interrupt(done, total):
         if done > 10:

@@ -6,10 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxmpc.loop.reference import Reference
 
 from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.errors import InputError
-from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import simulate, simulate_batch
 from jaxmpc.model.step_response import (
     StepResponseModel,

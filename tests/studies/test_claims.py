@@ -99,7 +99,7 @@ def thesis():
 
 
 def soft():
-    data = resting(catalogue.STUDIES["soft"](True, "jax"))
+    data = resting(catalogue.comparison_of("soft", True, "jax").definition)
     samples = data.sizes["time"]
     for name in ("nominal", "soft"):
         moved(data, name, 8.0 + (swinging(samples, 200, 560) if name == "nominal" else 0.0))
@@ -108,7 +108,7 @@ def soft():
 
 def without_soft(factor=3.0):
     """The choke swings by 2 %, for which 200 and 4 m3/h are predicted; the well does so many times that."""
-    data = resting(catalogue.STUDIES["without-soft"](True, "jax"))
+    data = resting(catalogue.comparison_of("without-soft", True, "jax").definition)
     samples = data.sizes["time"]
     swing = swinging(samples, 10, 155)
     for name in ("soft", "no-soft", "no-soft-plain"):
@@ -123,7 +123,7 @@ def without_soft(factor=3.0):
 
 def predictions():
     """The plan expects oil to arrive and gas to end 987 m3/h short; feedback goes further and reaches both."""
-    data = resting(catalogue.STUDIES["predictions"](True, "jax"))
+    data = resting(catalogue.comparison_of("predictions", True, "jax").definition)
     k = np.arange(data.sizes["time"])
     data.plan.values[:, 60, 0] = (10.0, 100.0)
     moved(data, "closed-loop", np.where(k < 60, 50.0, 62.0), np.where(k < 60, 7500.0, 8000.0))
@@ -134,21 +134,21 @@ def predictions():
 
 
 def fine_regulation():
-    data = resting(catalogue.STUDIES["fine-regulation"](True, "jax"))
+    data = resting(catalogue.comparison_of("fine-regulation", True, "jax").definition)
     k = np.arange(data.sizes["time"])
     data.measurement.values[0, :300] += (500.0, -5.0)
     return moved(data, "mixed-integer", 50.0, 7500.0 + np.clip(k - 299, 0, 100) * 5.0)
 
 
 def disturbance():
-    data = resting(catalogue.STUDIES["disturbance"](True, "jax"))
+    data = resting(catalogue.comparison_of("disturbance", True, "jax").definition)
     k = np.arange(data.sizes["time"])
     data.measurement.values[0, 100:150, OIL] -= 9.0
     return moved(data, "mixed-integer", 50.0, 7500.0 + np.clip(k - 99, 0, 100) * 2.0)
 
 
 def unblocked():
-    data = resting(catalogue.STUDIES["unblocked"](False, "jax"))
+    data = resting(catalogue.comparison_of("unblocked", False, "jax").definition)
     for name in ("no-blocks", "mixed-integer-no-blocks"):
         data.solve_time.values[at(data, name)] = 0.01
     return data
@@ -174,7 +174,11 @@ def judged(data, row):
 
 @pytest.mark.parametrize("study", STUDIES)
 def test_every_row_holds_on_runs_made_to_show_it(study):
-    evidence = claims.Evidence.of(STUDIES[study]())
+    evidence = claims.Evidence.of(
+        catalogue.comparison_of(
+            study,
+        ).definition
+    )
     rows = [row for row in ROWS if row.study == study]
     said = {row.id: claims.judge(row, evidence) for row in rows}
     assert {id: claim.verdict for id, claim in said.items()} == dict.fromkeys(said, "holds")
@@ -365,7 +369,7 @@ def test_rows_name_what_exists():
     assert len(ROW) == len(ROWS) > 40
     for row in ROWS:
         assert set(row.figures) <= set(FIGURES), row.id
-        study = catalogue.STUDIES[row.study](False, "jax")
+        study = catalogue.comparison_of(row.study, False, "jax").definition
         roles = {record.ROLES.get((one.kind, one.actuator)) for one in study.controllers}
         assert set(row.needs) <= roles | {one.name for one in study.controllers}, row.id
         assert all((row.statement, row.definition, row.rule))
@@ -445,13 +449,15 @@ def stubbed(tmp_path, monkeypatch):
     monkeypatch.setattr(claims_study, "is_current", lambda definition, folder: definition.name in ran)
 
     def run_named(name, out, quick, plant, **_):
-        folder = Path(out) / catalogue.STUDIES[name](quick, plant).name
+        folder = Path(out) / catalogue.comparison_of(name, quick, plant).definition.name
         ran.append(folder.name)
         return folder
 
     def opened(folder):
         study = next(name for name in STUDIES if Path(folder).name == f"{name}-quick-fmu")
-        return STUDIES[study]()
+        return catalogue.comparison_of(
+            study,
+        ).definition
 
     monkeypatch.setattr(claims_study.catalogue, "run_named", run_named)
     monkeypatch.setattr(claims_study, "open_results", opened)
@@ -528,7 +534,7 @@ def test_a_run_is_timed_on_the_host_over_its_first_part(monkeypatch):
     from jaxmpc.process.well.plant import WellPlant
 
     monkeypatch.setattr(claims_study, "TIMED", 60.0)
-    study = catalogue.STUDIES["unblocked"](True, "jax")
+    study = catalogue.comparison_of("unblocked", True, "jax").definition
     times = claims_study.step_times(study, "blocks", identify_step_response(WellPlant()))
     assert times.shape == (6,)
     assert (times > 0).all()

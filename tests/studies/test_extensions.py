@@ -15,11 +15,11 @@ from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
 from jaxmpc.problem.tuning import make_tuning
 from jaxmpc.process.well.plant import WellPlant
-from studies.definition import presets
 from studies.definition.comparison import ComparisonDefinition, ControllerDefinition, ReferenceDefinition
 from studies.run import comparison
 from studies.store.reading import open_results
 from studies.thesis import catalogue, report, time_limits
+from studies.thesis.well import WELL
 
 AT = np.array([11000.0, 185.0]), np.array([50.0, 7500.0])  # CVs, MVs
 KINDS = pytest.mark.parametrize("integer", [False, True], ids=["continuous", "mixed-integer"])
@@ -28,7 +28,7 @@ KINDS = pytest.mark.parametrize("integer", [False, True], ids=["continuous", "mi
 @pytest.mark.parametrize("quick", [False, True])
 @pytest.mark.parametrize("name", ["gain-scheduling", "mean-move", "time-limit"])
 def test_every_study_has_controllers_that_can_be_built(name, quick):
-    definition = catalogue.STUDIES[name](quick, "jax")
+    definition = catalogue.comparison_of(name, quick, "jax").definition
     definition.check()
     assert definition.name == f"{name}-{'quick-' if quick else ''}jax"
     for entry in FIGURES.values():
@@ -196,7 +196,7 @@ def test_a_controller_with_a_schedule_runs_differently_and_is_stored_under_anoth
 
 
 def test_a_scheduled_controller_without_a_schedule_is_refused(model):
-    definition = catalogue.STUDIES["gain-scheduling"](True, "jax")
+    definition = catalogue.comparison_of("gain-scheduling", True, "jax").definition
     with pytest.raises(InputError, match="gain schedule"):
         comparison.run_controller(
             definition.controllers[1], definition, model, lambda actuator: WellPlant(actuator=actuator), False
@@ -230,7 +230,7 @@ def test_a_grid_that_cannot_be_identified_is_refused(field, arguments):
 
 
 def test_the_presets_reach_the_predictive_mode_through_a_definition():
-    definition = catalogue.STUDIES["mean-move"](True, "jax")
+    definition = catalogue.comparison_of("mean-move", True, "jax").definition
     modes = {c.name: c.structure().mean_move_mode for c in definition.controllers}
     assert modes["continuous-predictive"] == modes["mixed-integer-predictive"] == "predictive"
-    assert modes["continuous-reactive"] == presets.structure().mean_move_mode == "reactive"
+    assert modes["continuous-reactive"] == WELL.structure().mean_move_mode == "reactive"

@@ -33,13 +33,13 @@ def test_claims_and_the_results_that_they_are_measured_on(tmp_path):
         rows.append([row for row in body["claims"] if row["id"] not in TIMED])
     assert rows[0] == rows[1]
     for study in claims_study.NEEDED:
-        name = catalogue.STUDIES[study](True, "jax").name
+        name = catalogue.comparison_of(study, True, "jax").definition.name
         assert_same([out / name for out in outs])
 
 
 @pytest.mark.parametrize("study", sorted(set(catalogue.STUDIES) - set(claims_study.NEEDED)))
 def test_a_study_beyond_the_thesis_where_no_clock_stops_a_step(study, tmp_path):
-    definition = catalogue.STUDIES[study](True, "jax")
+    definition = catalogue.comparison_of(study, True, "jax").definition
     unlimited = tuple(controller for controller in definition.controllers if controller.time_limit is None)
     definition = msgspec.structs.replace(definition, controllers=unlimited)
     assert_same([thesis.run_definition(definition, tmp_path / which, **QUIET) for which in "ab"])

@@ -16,10 +16,10 @@ from jaxmpc.loop.simulate import simulate
 from jaxmpc.process.reference import Reference
 from jaxmpc.process.well.plant import WellPlant
 from studies.definition import comparison as definition
-from studies.definition import presets
 from studies.run import comparison
 from studies.store.reading import open_results, provenance
 from studies.thesis import catalogue, plans
+from studies.thesis.well import WELL
 from tests import studies_synthetic as made
 
 STEP = Reference([0.0, 50.0], [[11013.0, 185.0], [12600.0, 175.0]], 400.0)
@@ -37,8 +37,8 @@ def model():
 
 
 def controller_of(kind, model, changes=None):
-    structure = presets.structure(integer=kind == "mixed-integer")
-    return Controller(structure, presets.tuning(structure, changes=changes), model)
+    structure = WELL.structure(integer=kind == "mixed-integer")
+    return Controller(structure, WELL.tuning(structure, changes=changes), model)
 
 
 def run(kind, model, **how):
@@ -76,7 +76,7 @@ def test_a_controller_that_takes_over_goes_on_from_the_state_of_the_one_before(m
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_open_loop_carries_out_its_plan_and_then_holds(model, kind):
-    structure = presets.structure(integer=kind == "mixed-integer")
+    structure = WELL.structure(integer=kind == "mixed-integer")
     short = Reference([0.0, 50.0], [[11013.0, 185.0], [12600.0, 175.0]], 2300.0)
     how = dict(open_loop_from=50.0, keep_plans=True)
     drop = np.where(np.arange(230) > 20, -3.0, 0.0)
@@ -127,12 +127,12 @@ def test_plans_are_kept_only_where_they_are_asked_for(model):
 )
 def test_interventions_that_do_not_fit_are_refused_before_the_run(model, how, field):
     same = controller_of("continuous", model)
-    structure = presets.structure()
+    structure = WELL.structure()
     longer = dataclasses.replace(model, coefficients=model.extended(300))
     others = {
         None: lambda: same,
         "other structure": lambda: controller_of("mixed-integer", model),
-        "longer model": lambda: Controller(structure, presets.tuning(structure), longer),
+        "longer model": lambda: Controller(structure, WELL.tuning(structure), longer),
     }
     given = {**how, "changes": [(time, others[name]()) for time, name in how.get("changes", ())]}
     with pytest.raises(InputError) as error:
@@ -222,19 +222,22 @@ def test_what_a_scenario_adds_is_part_of_what_identifies_a_run():
 @pytest.mark.parametrize("quick", [False, True])
 @pytest.mark.parametrize("name", catalogue.STUDIES)
 def test_every_study_of_the_catalogue_can_be_run_and_written_down(name, quick, plant):
-    study = catalogue.STUDIES[name](quick, plant)
+    study = catalogue.comparison_of(name, quick, plant).definition
     study.check()
     assert study.name == f"{name}-{'quick-' if quick else ''}{plant}"
     assert msgspec.json.decode(msgspec.json.encode(study), type=type(study)) == study
     if quick:
-        assert study.reference.duration < catalogue.STUDIES[name](False, plant).reference.duration
+        assert (
+            study.reference.duration
+            < catalogue.comparison_of(name, False, plant).definition.reference.duration
+        )
 
 
 def test_names_that_are_not_in_the_catalogue_are_refused_before_anything_is_written(tmp_path):
     with pytest.raises(InputError, match="one of thesis, soft"):
-        catalogue.run_named("softly", tmp_path / "out")
+        catalogue.run_thesis("softly", tmp_path / "out")
     with pytest.raises(InputError, match="plant"):
-        catalogue.run_named("soft", tmp_path / "out", plant="fmy")
+        catalogue.run_thesis("soft", tmp_path / "out", plant="fmy")
     assert not (tmp_path / "out").exists()
 
 
@@ -372,13 +375,13 @@ def test_a_study_takes_finished_runs_over_from_another(tmp_path, monkeypatch):
 
 def test_a_named_study_runs_from_nothing_and_a_second_call_computes_nothing(tmp_path):
     lines = []
-    go = lambda: catalogue.run_named(  # noqa: E731
+    go = lambda: catalogue.run_thesis(  # noqa: E731
         "predictions", tmp_path, quick=True, plant="jax", progress=False, say=lines.append
     )
     data = open_results(go()).load()
     assert data.complete.values.tolist() == [1, 1]
     closed, blind = (data.sel(controller=name) for name in ("closed-loop", "open-loop"))
-    step = catalogue.STUDIES["predictions"](True, "jax").reference.times[1]
+    step = catalogue.comparison_of("predictions", True, "jax").definition.reference.times[1]
     at = int(step / 10)
     # one loop runs in strides and the other sample by sample: two programs, whose sums differ in the last bits
     np.testing.assert_allclose(closed.demand[: at + 1], blind.demand[: at + 1], rtol=1e-12)

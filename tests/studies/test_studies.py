@@ -9,13 +9,13 @@ import pytest
 
 from jaxmpc.errors import InputError
 from jaxmpc.process.reference import Reference
-from studies.definition import presets, references
 from studies.definition.comparison import ControllerDefinition, ReferenceDefinition
 from studies.kpi import evaluate
 from studies.run import comparison
 from studies.store import fingerprint
 from studies.store.reading import open_results
 from studies.thesis import catalogue, claims, report
+from studies.thesis.well import WELL
 from tests import studies_synthetic as made
 
 
@@ -33,7 +33,7 @@ def results(stored):
 
 
 def test_the_thesis_preset_is_table_1_with_the_choke_weight_in_percent():
-    tuning = presets.tuning(presets.structure(integer=True))
+    tuning = WELL.tuning(WELL.structure(integer=True))
     np.testing.assert_allclose(tuning.cv_weight, [1e-4, 0.1])
     np.testing.assert_allclose(tuning.soft_quadratic, [1e-4, 0.1])
     np.testing.assert_allclose(tuning.soft_linear, [1e-4, 0.1])
@@ -50,20 +50,20 @@ def test_the_thesis_preset_is_table_1_with_the_choke_weight_in_percent():
 
 
 def test_only_the_mixed_integer_controller_has_oscillation_rows():
-    assert not presets.tuning(presets.structure()).oscillation_rows.any()
+    assert not WELL.tuning(WELL.structure()).oscillation_rows.any()
 
 
-@pytest.mark.parametrize("name", presets.TUNINGS)
+@pytest.mark.parametrize("name", WELL.presets)
 @pytest.mark.parametrize("blocking", ["moves", "inputs", "none"])
 @pytest.mark.parametrize("integer", [False, True])
 def test_every_preset_builds_for_every_structure(name, blocking, integer):
-    structure = presets.structure(blocking, integer=integer)
+    structure = WELL.structure(blocking, integer=integer)
     assert structure.block_count == (200 if blocking == "none" else 16)
-    presets.tuning(structure, name)
+    WELL.tuning(structure, name)
 
 
 def test_without_soft_mpc_the_weight_far_outside_the_deadzone_stays():
-    soft, hard = (presets.tuning(presets.structure(), name) for name in ("thesis", "no-soft"))
+    soft, hard = (WELL.tuning(WELL.structure(), name) for name in ("thesis", "no-soft"))
     np.testing.assert_allclose(hard.cv_weight, soft.cv_weight + soft.soft_quadratic)
     assert not hard.soft_quadratic.any()
     assert not hard.soft_linear.any()
@@ -71,23 +71,23 @@ def test_without_soft_mpc_the_weight_far_outside_the_deadzone_stays():
 
 def test_unknown_presets_and_fields_are_refused():
     with pytest.raises(InputError, match="one of the presets"):
-        presets.tuning(presets.structure(), "thesys")
+        WELL.tuning(WELL.structure(), "thesys")
     with pytest.raises(InputError, match=r"tuning\.cv_wieght"):
-        presets.tuning(presets.structure(), changes={"cv_wieght": 1})
+        WELL.tuning(WELL.structure(), changes={"cv_wieght": 1})
     with pytest.raises(InputError, match="'moves', 'inputs' or 'none'"):
-        presets.structure("block")
+        WELL.structure("block")
 
 
 def test_changes_do_not_reach_the_preset():
-    presets.tuning_fields("thesis")["cv_weight"]["gas_rate"] = 7.0
-    assert presets.TUNINGS["thesis"]["cv_weight"]["gas_rate"] == 1e-4
+    WELL.tuning_fields("thesis")["cv_weight"]["gas_rate"] = 7.0
+    assert WELL.presets["thesis"]["cv_weight"]["gas_rate"] == 1e-4
 
 
 # references
 
 
 def test_the_thesis_reference_has_7800_samples_in_13_windows():
-    reference = references.thesis()
+    reference = WELL.reference("thesis")
     setpoint = reference.sample(10.0)
     assert setpoint.shape == (7800, 2)
     np.testing.assert_allclose(
@@ -99,7 +99,7 @@ def test_the_thesis_reference_has_7800_samples_in_13_windows():
 def test_the_quick_reference_uses_windows_of_the_thesis_reference():
     thesis_targets = {row[1:] for row in references.THESIS_WINDOWS}
     assert {row[1:] for row in references.QUICK_WINDOWS} <= thesis_targets
-    assert len(references.quick().sample(10.0)) <= 1200
+    assert len(WELL.reference("quick").sample(10.0)) <= 1200
 
 
 def test_a_change_between_two_samples_counts_from_the_next_sample():
@@ -143,7 +143,7 @@ def test_setpoints_shorter_than_the_run_are_refused():
 
 
 def test_the_thesis_definition_is_checked_and_survives_json():
-    definition = catalogue.STUDIES["thesis"](True, "jax")
+    definition = catalogue.comparison_of("thesis", True, "jax").definition
     definition.check()
     assert msgspec.json.decode(msgspec.json.encode(definition), type=type(definition)) == definition
     assert [c.structure().integer_mvs for c in definition.controllers] == [(), (), (0,)]
@@ -261,7 +261,7 @@ def test_an_interrupted_run_keeps_what_was_done(tmp_path, monkeypatch, stubbed):
 
 def test_bad_requests_are_refused_before_anything_is_written(tmp_path):
     with pytest.raises(InputError, match="plant"):
-        catalogue.run_named("thesis", tmp_path / "out", plant="fmy")
+        catalogue.run_thesis("thesis", tmp_path / "out", plant="fmy")
     assert not (tmp_path / "out").exists()
 
 

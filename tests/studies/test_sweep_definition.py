@@ -11,13 +11,13 @@ import pytest
 from jaxmpc.errors import InputError
 from jaxmpc.process.well.equations import WellParameters
 from studies import load
-from studies.definition import presets, references
 from studies.definition.estimate import MODEL_SECONDS
 from studies.definition.fields import FIELDS, PLANT_FIELDS
 from studies.definition.models import identify_models
 from studies.definition.sweep import StudyDefinition, load_definition, shipped_studies
 from studies.load import load_study
 from studies.store import fingerprint
+from studies.thesis.well import WELL
 
 WEIGHT = "tuning.move_weight.choke"
 ONE = [{"key": WEIGHT, "values": [250.0]}]
@@ -254,14 +254,14 @@ def test_a_scenario_without_settings_is_the_thesis_controller_on_the_shipped_wel
     scenario = expand().scenario(0)
     assert scenario.kind == "mixed-integer"
     assert scenario.actuator == "step"
-    assert scenario.structure == presets.structure("moves", integer=True)
-    thesis = presets.tuning(scenario.structure)
+    assert scenario.structure == WELL.structure("moves", integer=True)
+    thesis = WELL.tuning(scenario.structure)
     for name in ("cv_weight", "move_weight", "mean_move_limit", "oscillation_rows", "bias_cutoff", "mv_low"):
         np.testing.assert_array_equal(getattr(scenario.tuning, name), getattr(thesis, name))
     assert scenario.plant == WellParameters()
     assert scenario.model_point == (50.0, 7500.0)
     assert scenario.samples == 7800
-    np.testing.assert_array_equal(scenario.reference.setpoints, references.thesis().setpoints)
+    np.testing.assert_array_equal(scenario.reference.setpoints, WELL.reference("thesis").setpoints)
     assert scenario.noise is None
     assert scenario.disturbance is None
 

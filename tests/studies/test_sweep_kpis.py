@@ -11,13 +11,13 @@ from jaxmpc import status as codes
 from jaxmpc.errors import InputError
 from jaxmpc.loop.trajectory import TrajectoryBatch
 from jaxmpc.problem.tuning import make_tuning, stack_tunings
-from studies.definition import presets
 from studies.kpi import evaluate
 from studies.kpi.sweep import ALWAYS, KPIS, RECORD, batch_kpis, channels_of, run_kpis, runs_of
 from studies.store.reading import open_results
+from studies.thesis.well import WELL
 from tests import studies_synthetic as made
 
-STRUCTURE = presets.structure()
+STRUCTURE = WELL.structure()
 WINDOW = np.array([0] * 4 + [1] * 8)
 TUNING = make_tuning(
     STRUCTURE,
@@ -146,7 +146,7 @@ def random_tunings(lanes: int = LANES, seed: int = 1):
     rng = np.random.default_rng(seed)
     return stack_tunings(
         [
-            presets.tuning(
+            WELL.tuning(
                 STRUCTURE,
                 changes={"deadzone": rng.uniform([500, 2], [1500, 6]).tolist(), "cv_high": [1.02e4, 160.0]},
             )
@@ -230,7 +230,7 @@ def test_lanes_do_not_depend_on_their_place():
 
 def test_one_tuning_and_one_row_of_windows_serve_all_lanes():
     batch, window = random_batch()
-    tuning = presets.tuning(STRUCTURE)
+    tuning = WELL.tuning(STRUCTURE)
     each = batch_kpis(batch, stack_tunings([tuning] * LANES), np.stack([window[0]] * LANES))
     assert_equal(each, batch_kpis(batch, tuning, window[0]))
 
@@ -251,7 +251,7 @@ def test_only_volumes_and_limits_depend_on_where_the_setpoint_is():
 
 def test_columns_are_found_by_name():
     batch, window = random_batch()
-    tuning = presets.tuning(STRUCTURE)
+    tuning = WELL.tuning(STRUCTURE)
     flipped = dataclasses.replace(
         changed(batch, **{key: batch[key][..., ::-1] for key in ("cv", "mv", "mv_demand", "move")}),
         setpoint=batch.setpoint[..., ::-1],
@@ -286,7 +286,7 @@ def test_a_run_that_rests_at_its_setpoint_has_nothing_to_report():
     level, position = np.tile([10_000.0, 150.0], (1, 30, 1)), np.tile([50.0, 7500.0], (1, 30, 1))
     found = batch_kpis(
         batch_of(level, level, position, position, np.zeros((1, 30, 2))),
-        presets.tuning(STRUCTURE),
+        WELL.tuning(STRUCTURE),
         np.arange(30) // 10,
     )
     undefined = {"overshoot", "settling_time_mean", "settling_time_max", "mean_dwell", "shortest_dwell"}
@@ -312,7 +312,7 @@ def test_the_move_of_the_first_sample_starts_at_the_position_before_the_run():
     move = np.zeros((1, 3, 2))
     move[0, 0] = [4.3, -200.0]
     found = batch_kpis(
-        batch_of(level, level, position, demand, move), presets.tuning(STRUCTURE), np.zeros(3, int)
+        batch_of(level, level, position, demand, move), WELL.tuning(STRUCTURE), np.zeros(3, int)
     )
     assert found["choke_travel"][0] == pytest.approx(4.0)
     assert found["lift_travel"][0] == pytest.approx(200.0)
@@ -331,7 +331,7 @@ def test_a_run_that_is_not_finite_throughout_never_looks_good(field, sample, val
         if field == "setpoint"
         else changed(batch, **{field: spoilt})
     )
-    tuning = presets.tuning(STRUCTURE)
+    tuning = WELL.tuning(STRUCTURE)
     found, sound = batch_kpis(bad, tuning, window), batch_kpis(batch, tuning, window)
     assert found["finite"].tolist() == [1.0, 0.0, 1.0, 1.0, 1.0]
     for name, values in found.items():
@@ -347,7 +347,7 @@ def test_samples_without_a_plan_are_counted_and_leave_no_objective_and_no_gap():
     fields["status"][0, 9] = codes.LIMIT
     fields["fallback"][0, 5:8] = True
     fields["objective"][0, 5:8] = fields["gap"][0, 5:8] = np.nan
-    found = batch_kpis(changed(batch, **fields), presets.tuning(STRUCTURE), window)
+    found = batch_kpis(changed(batch, **fields), WELL.tuning(STRUCTURE), window)
     assert found["fallbacks"].tolist() == [3.0, 0.0, 0.0, 0.0, 0.0]
     assert found["not_optimal"].tolist() == [4.0, 0.0, 0.0, 0.0, 0.0]
     assert np.isnan(found["objective"]).tolist() == [True, False, False, False, False]
@@ -388,9 +388,9 @@ def test_a_second_batch_of_the_same_shape_compiles_nothing():
     jax.monitoring.register_event_duration_secs_listener(monitor)
     try:
         batch_kpis(second, random_tunings(seed=6), others, tolerance=[1.0, 2.0])
-        batch_kpis(second, presets.tuning(STRUCTURE), others[0])
+        batch_kpis(second, WELL.tuning(STRUCTURE), others[0])
         assert not [event for event in compiled if "backend_compile" in event]
-        batch_kpis(*random_batch(samples=41)[:1], presets.tuning(STRUCTURE), np.zeros(41, int))
+        batch_kpis(*random_batch(samples=41)[:1], WELL.tuning(STRUCTURE), np.zeros(41, int))
         assert [event for event in compiled if "backend_compile" in event]  # the monitor does see one
     finally:
         jax.monitoring.unregister_event_duration_listener(monitor)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from jaxmpc.errors import InputError, MissingToolError
-from studies.definition import presets
 from studies.definition.models import identify_models
 from studies.definition.sweep import StudyDefinition, shipped_studies
 from studies.kpi.objectives import front, unbeaten
@@ -22,6 +21,7 @@ from studies.search import run as search
 from studies.search.run import run_search
 from studies.search.study import SearchStudy
 from studies.store.reading import chunk_facts, kpi_frame, open_study, provenance
+from studies.thesis.well import WELL
 
 WEIGHT, LIFT = "tuning.move_weight.choke", "tuning.move_weight.gas_lift"
 DEADZONE = ("tuning.deadzone.gas_rate", "tuning.deadzone.oil_rate")
@@ -254,7 +254,7 @@ def test_the_quick_cut_replaces_batches_axes_and_batch_size():
 def test_the_shipped_search_is_checked_in_both_sizes_and_its_space_holds_the_thesis_tuning():
     assert "tune" in shipped_studies()
     full, cut = load_study("tune"), load_study("tune", quick=True)
-    thesis = presets.tuning_fields("thesis")
+    thesis = WELL.tuning_fields("thesis")
     for made in (full, cut):
         assert isinstance(made, SearchStudy)
         for parameter in made.parameters:
