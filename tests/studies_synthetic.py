@@ -16,6 +16,7 @@ from studies.store.reading import open_results
 from studies.store.trajectories import run_fields
 from studies.store.writing import Store
 from studies.thesis import catalogue
+from studies.thesis.well import WELL
 
 DT = 10.0
 CONTROLLERS = catalogue.comparison_of("thesis", False, "jax").definition.controllers
@@ -27,6 +28,7 @@ def definition(**changes) -> ComparisonDefinition:
     fields = {
         "name": "made-up",
         "title": "Made-up comparison",
+        "process": WELL.name,
         "plant": "jax",
         "controllers": CONTROLLERS,
         "reference": REFERENCE,
@@ -69,7 +71,7 @@ def layout(
 ) -> StoreLayout:
     """The store of the comparison."""
     facts = {"kind": "jax"}, {"jaxmpc": "none"} if code is None else code
-    return comparison_layout(of or definition(), model(), extra, list(hashes), study_hash, *facts)
+    return comparison_layout(of or definition(), WELL, model(), extra, list(hashes), study_hash, *facts)
 
 
 def begin(folder, given: StoreLayout | None = None, say=lambda line: None) -> Store:
@@ -102,7 +104,7 @@ def trajectory(kind: str, samples: int = 400) -> Trajectory:
     """A run in which the choke rises in a staircase to 40 %, then holds (`smooth`), swings by 2 % every ten
     samples (`hunting`), or creeps (`creeping`)."""
     k = np.arange(samples)
-    reference = REFERENCE.build()
+    reference = REFERENCE.build(WELL)
     setpoint = reference.sample(DT, samples)
     move = np.zeros(samples)
     move[:20:2] = 2.0  # 20 % in ten moves: the windowed mean passes 0.55 with the seventh

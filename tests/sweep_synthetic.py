@@ -19,8 +19,8 @@ LIMIT = ("tuning.mean_move_limit.choke", "limit of the mean move of the choke", 
 THESIS_BLOCKS = "1 1 1 1 2 2 4 4 8 8 8 16 16 32 32 64"
 
 KEY_FIGURES = (
-    Variable("choke_travel", "sum of absolute choke moves, actual position", "%"),
-    Variable("choke_reversals", "choke moves against the move before", "1"),
+    Variable("travel", "sum of absolute moves, actual position", "mv_unit", ("mv",)),
+    Variable("reversals", "moves against the move before", "1", ("mv",)),
     Variable("mean_absolute_deviation", "mean absolute deviation from the setpoint", "cv_unit", ("cv",)),
     Variable("closed_loop_cost", "tracking and move cost of the realised run", "1"),
     Variable("solve_time_median", "median time of one controller step", "s"),
@@ -48,8 +48,8 @@ def numbers(count, seed=0, cvs=2):
     """Made-up key figures."""
     rng = np.random.default_rng(seed)
     return {
-        "choke_travel": rng.uniform(100, 800, count),
-        "choke_reversals": rng.integers(0, 90, count).astype(float),
+        "travel": np.stack([rng.uniform(100, 800, count), np.full(count, 5000.0)], axis=1),
+        "reversals": np.stack([rng.integers(0, 90, count).astype(float), np.full(count, 7.0)], axis=1),
         "mean_absolute_deviation": rng.uniform(0.5, 2, (count, cvs)) * (1000.0, 5.0),
         "closed_loop_cost": rng.uniform(90, 110, count),
         "solve_time_median": rng.uniform(1e-3, 5e-3, count),

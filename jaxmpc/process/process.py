@@ -190,7 +190,7 @@ class Process:
             InputError: naming the field.
         """
         if blocking not in BLOCKING:
-            raise InputError("structure.blocking", blocking, " or ".join(map(repr, BLOCKING)))
+            raise InputError("structure.blocking", blocking, "'moves', 'inputs' or 'none'")
         given = dict(self.structure_fields)
         given |= {"blocks": ()} if blocking == "none" else {"blocking": blocking}
         if integer:

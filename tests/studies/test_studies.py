@@ -97,8 +97,8 @@ def test_the_thesis_reference_has_7800_samples_in_13_windows():
 
 
 def test_the_quick_reference_uses_windows_of_the_thesis_reference():
-    thesis_targets = {row[1:] for row in references.THESIS_WINDOWS}
-    assert {row[1:] for row in references.QUICK_WINDOWS} <= thesis_targets
+    thesis_targets = set(map(tuple, WELL.reference("thesis").setpoints.tolist()))
+    assert set(map(tuple, WELL.reference("quick").setpoints.tolist())) <= thesis_targets
     assert len(WELL.reference("quick").sample(10.0)) <= 1200
 
 
@@ -144,10 +144,10 @@ def test_setpoints_shorter_than_the_run_are_refused():
 
 def test_the_thesis_definition_is_checked_and_survives_json():
     definition = catalogue.comparison_of("thesis", True, "jax").definition
-    definition.check()
+    definition.check(WELL)
     assert msgspec.json.decode(msgspec.json.encode(definition), type=type(definition)) == definition
-    assert [c.structure().integer_mvs for c in definition.controllers] == [(), (), (0,)]
-    weights = {float(c.build_tuning().move_weight[0]) for c in definition.controllers}
+    assert [c.structure(WELL).integer_mvs for c in definition.controllers] == [(), (), (0,)]
+    weights = {float(c.build_tuning(WELL).move_weight[0]) for c in definition.controllers}
     assert weights == {250.0}
 
 
