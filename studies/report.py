@@ -121,10 +121,13 @@ def table_csv(figures: xr.Dataset) -> str:
     for name in figures.controller.values:
         for key, variable in figures.data_vars.items():
             row = variable.sel(controller=name)
-            labels = row[row.dims[0]].values if row.dims else [""]
-            for label, value in zip(labels, np.atleast_1d(row.values), strict=True):
+            for place in np.ndindex(row.shape):
+                at = [str(row[axis].values[i]) for axis, i in zip(row.dims, place, strict=True)]
                 unit = row.attrs["units"]
-                if "cv_unit" in unit:
-                    unit = unit.replace("cv_unit", str(figures.cv_unit.sel(cv=label).item()))
-                rows.append([name, key, label, repr(value.item()), unit])
+                for axis, channel in zip(row.dims, at, strict=True):
+                    if f"{axis}_unit" in unit:
+                        unit = unit.replace(
+                            f"{axis}_unit", str(figures[f"{axis}_unit"].sel({axis: channel}).item())
+                        )
+                rows.append([name, key, " ".join(at), repr(row.values[place].item()), unit])
     return csv_text(["controller", "key_figure", "of", "value", "unit"], rows)

@@ -29,7 +29,12 @@ DOORS = {
     "zarr": ("studies/",),
     "google_crc32c": ("studies/store/",),
     "optuna": ("studies/search/run.py",),
-    "scipy": ("jaxmpc/integer/tighten.py", "studies/bench/", "studies/definition/axes.py"),
+    "scipy": (
+        "jaxmpc/integer/tighten.py",
+        "identify/judge.py",
+        "studies/bench/",
+        "studies/definition/axes.py",
+    ),
     "clarabel": ("jaxmpc/integer/tighten.py", "studies/bench/peers.py"),
     **dict.fromkeys(("piqp", "osqp", "daqp", "qpax", "pyscipopt", "gurobipy"), ("studies/bench/peers.py",)),
 }
@@ -51,7 +56,7 @@ GROUND = (
     "programs",
 )  # used by all of them, and using nothing else
 BESIDE = {
-    "process": {"model"},
+    "process": {"model", "problem"},
     "steady": {"model", "problem", "relaxed", "integer"},  # `integer.highs` is the door of both
 }
 MAY_USE = {

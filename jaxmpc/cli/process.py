@@ -73,6 +73,8 @@ def _sized(text: str) -> tuple[str, float]:
 def check(options: Options) -> int:
     """Judge a process file and its model, and draw the step responses."""
     check_folder("--out", options.out)
+    import numpy as np
+
     from figures.process import draw_responses
     from identify.judge import judge
     from identify.plants import model_of
@@ -90,7 +92,9 @@ def check(options: Options) -> int:
         if looked
         else f"{process.name}: nothing to mend."
     )
-    for path in draw_responses(process, model, options.out):
+    responses = np.concatenate([np.asarray(model.coefficients), np.asarray(model.dv_coefficients)], axis=1)
+    measured = list(zip(model.dv_names, model.dv_units or ("1",) * len(model.dv_names), strict=True))
+    for path in draw_responses(process, responses, measured, options.out):
         print(path)
     return EXIT_OPTIMAL
 

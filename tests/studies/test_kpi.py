@@ -13,7 +13,7 @@ def test_travel_is_the_sum_of_absolute_moves_from_the_position_before_the_run():
     move = kpi.moves_of(np.array([52.0, 52.0, 48.0, 50.0]), 50.0)
     np.testing.assert_allclose(move, [2.0, 0.0, -4.0, 2.0])
     assert float(kpi.travel(move)) == 8.0
-    assert int(kpi.move_count(move)) == 3
+    assert int(kpi.move_count(move, 0.05)) == 3
 
 
 def test_a_reversal_is_a_move_against_the_move_before_it_however_long_ago():
@@ -24,8 +24,8 @@ def test_a_reversal_is_a_move_against_the_move_before_it_however_long_ago():
 
 def test_creeping_below_the_threshold_is_neither_a_move_nor_a_reversal():
     move = np.array([0.04, -0.04, 2.0, -0.04, 2.0, -0.06])
-    assert int(kpi.move_count(move)) == 3
-    assert np.flatnonzero(kpi.reversal_events(move)).tolist() == [5]
+    assert int(kpi.move_count(move, 0.05)) == 3
+    assert np.flatnonzero(kpi.reversal_events(move, 0.05)).tolist() == [5]
 
 
 def test_reversals_are_compared_within_a_segment_only():
@@ -93,8 +93,8 @@ def test_a_staircase_is_openings_that_go_on_after_a_pause_above_the_limit():
 def test_openings_above_the_limit_look_at_the_moves_before():
     move = np.array([2.0, 2.0, 2.0, 0.0, 2.0])
     # means before each sample, window of 4: 0, 0.5, 1.0, 1.5, 1.5
-    assert int(kpi.opening_above_limit(move, 4, 1.2)) == 1
-    assert int(kpi.opening_above_limit(move, 4, 1.5)) == 0
+    assert int(kpi.rises_above_limit(move, 4, 1.2)) == 1
+    assert int(kpi.rises_above_limit(move, 4, 1.5)) == 0
 
 
 def test_solve_times_and_gap():
@@ -115,7 +115,7 @@ def test_a_batch_gives_what_each_run_gives():
             kpi.count_by_segment(event, segment, 3),
             jnp.stack(kpi.dwell(move, 10.0)),
             kpi.mean_move_stops(move, 5, 0.5),
-            kpi.opening_above_limit(move, 5, 0.5),
+            kpi.rises_above_limit(move, 5, 0.5),
         )
 
     together = jax.vmap(figures)(jnp.asarray(moves))
@@ -132,7 +132,7 @@ def test_the_largest_excess_ignores_what_the_violations_do_not_count():
 
 
 def test_a_volume_is_a_rate_per_hour_times_the_seconds_that_it_holds():
-    assert float(kpi.volume(np.array([3600.0, 0.0, 7200.0]), 10.0)) == pytest.approx(30.0)
+    assert float(kpi.integral(np.array([3600.0, 0.0, 7200.0]), 10.0, 3600.0)) == pytest.approx(30.0)
 
 
 def test_the_closed_loop_cost_adds_tracking_soft_and_move_cost_per_sample():
