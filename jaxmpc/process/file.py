@@ -246,7 +246,8 @@ def _check_names(file: ProcessFile) -> None:
     for table in ("cv", "mv", "disturbance", "key_figure"):
         for i, section in enumerate(getattr(file, table)):
             path, expected = f"{table}[{i}].name", "letters, digits and '_', a letter first"
-            named = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,63}", section.name)
+            loads = [f"output.{cv.name}" for cv in file.cv] if table == "disturbance" else []
+            named = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,63}", section.name) or section.name in loads
             _require(named, path, section.name, expected)
             _require(
                 section.name not in seen,

@@ -105,10 +105,16 @@ def new_process(
             f'label = "load on {cv.replace("_", " ")}"',
         ]
         lines += [f"span = {_round(span / 5):g}", ""]
-    lines += _tuning(
-        model, cv_spans, [_move(*ranges[mv], steps.get(mv)) for mv in model.mv_names], horizon, control
-    )
-    lines += _references(model, cv_spans, point, horizon)
+    moves = [_move(*ranges[mv], steps.get(mv)) for mv in model.mv_names]
+    jumps = np.abs(gains) @ [
+        steps.get(mv, 0.0) for mv in model.mv_names
+    ]  # what one step of each stepped MV does
+    zones = [_round(max(span / 50, jump / 2)) for span, jump in zip(cv_spans, jumps.tolist(), strict=True)]
+    lines += _tuning(model, cv_spans, moves, zones, horizon, control)
+    shifts = [
+        _shift(span, steps.get(mv), mv in switches) for mv, span in zip(model.mv_names, spans, strict=True)
+    ]
+    lines += _references(model, np.array(shifts), point, horizon)
     return "\n".join(lines), guesses
 
 
@@ -139,6 +145,13 @@ def _range(unit: str, point: float | None, switch: bool) -> tuple[float, float]:
 def _move(low: float, high: float, step: float | None) -> float:
     """Largest move per sample: one step, or a fiftieth of the range."""
     return step or _round((high - low) / 50)
+
+
+def _shift(span: float, step: float | None, switch: bool) -> float:
+    """How far an MV is shifted for a setpoint: a third of its span, or between two positions, where rounding hunts."""
+    if switch:
+        return span
+    return span / 3 if step is None else (max(int(span / 3 / step), 1) + 0.5) * step
 
 
 def _horizons(model: StepResponseModel) -> tuple[int, int]:
@@ -187,7 +200,12 @@ def _table(names: Sequence[str], values: Sequence[float]) -> str:
 
 
 def _tuning(
-    model: StepResponseModel, spans: Sequence[float], moves: Sequence[float], horizon: int, control: int
+    model: StepResponseModel,
+    spans: Sequence[float],
+    moves: Sequence[float],
+    zones: Sequence[float],
+    horizon: int,
+    control: int,
 ) -> list[str]:
     cvs, mvs = model.cv_names, model.mv_names
     weights = [_round(1 / span**2) for span in spans]
@@ -200,7 +218,7 @@ def _tuning(
         "[presets.default] # guessed: a deviation of one span costs as much as ten of the largest moves",
         f"cv_weight = {_table(cvs, weights)} # 1/CV unit^2",
         f"move_weight = {_table(mvs, [_round(0.1 / move**2) for move in moves])} # 1/MV unit^2",
-        f"deadzone = {_table(cvs, [_round(span / 50) for span in spans])} # CV unit, half widths",
+        f"deadzone = {_table(cvs, zones)} # CV unit, half widths; half of what one step of the MVs does, at least",
         f"soft_quadratic = {_table(cvs, weights)} # beyond the deadzone",
         f"soft_linear = {_table(cvs, [0.0] * len(cvs))}",
         f"bias_cutoff = {_round(1 / (2 * model.dt)):g} # rad/s, guessed",
@@ -209,28 +227,29 @@ def _tuning(
 
 
 def _references(
-    model: StepResponseModel, spans: Sequence[float], point: Mapping[str, float], horizon: int
+    model: StepResponseModel, shifts: np.ndarray, point: Mapping[str, float], horizon: int
 ) -> list[str]:
-    """Steps of one setpoint after the other, a quarter of a span each."""
-    start = [point.get(cv, 0.0) for cv in model.cv_names]
-    rows, at, wait = [list(start)], list(start), math.ceil(1.2 * horizon) * model.dt
-    for i, span in enumerate(spans):
-        at[i] += _round(span / 4)
-        rows.append(list(at))
-    rows.append(list(start))
+    """Setpoints that the MVs can hold: one MV after the other is shifted, and at last all are back."""
+    gains = np.asarray(model.coefficients)[:, :, -1]
+    start = np.array([point.get(cv, 0.0) for cv in model.cv_names])
+    held = np.cumsum(np.concatenate([np.zeros((1, len(shifts))), np.diag(shifts)]), axis=0)
+    rows = [start + gains @ shift for shift in (*held, 0 * shifts)]
+    wait = math.ceil(1.2 * horizon) * model.dt
 
-    def windows(rows: Sequence[Sequence[float]]) -> str:
-        listed = [[k * wait + (k > 0) * 0.0, *row] for k, row in enumerate(rows)]
-        return "[" + ", ".join("[" + ", ".join(f"{v:.10g}" for v in row) + "]" for row in listed) + "]"
+    def windows(count: int) -> str:
+        listed = [
+            "[" + ", ".join(f"{v:.6g}" for v in (k * wait, *row)) + "]" for k, row in enumerate(rows[:count])
+        ]
+        return "[" + ", ".join(listed) + "]"
 
     listed = ", ".join(model.cv_names)
     return [
-        f"[references.steps] # guessed; rows: start [s], then setpoints of {listed}",
+        f"[references.steps] # guessed: what the MVs hold when shifted one after the other; rows: start [s], {listed}",
         f"duration = {len(rows) * wait:g} # s",
-        f"windows = {windows(rows)}",
+        f"windows = {windows(len(rows))}",
         "",
         "[references.quick]",
         f"duration = {2 * wait:g}",
-        f"windows = {windows(rows[:2])}",
+        f"windows = {windows(2)}",
         "",
     ]
