@@ -58,7 +58,7 @@ def _pairs(process: Process, model: StepResponseModel) -> list[Finding]:
             continue
         begin = int(np.argmax(np.abs(s[i, j]) > 0.02 * peak))
         rise = (int(np.argmax(np.abs(s[i, j]) >= 0.63 * abs(row.gain))) + 1 - begin) if row.gain else 0
-        words = f"gain {row.gain:.4g} {unit}, dead time {begin * model.dt:g} s, settled after {row.time:g} s"
+        words = f"gain {row.gain:.4g} {unit}, dead time {begin * model.dt:g} s, settled after {row.settling_time:g} s"
         if not row.settled:
             slope = (s[i, j, -1] - s[i, j, -2]) / model.dt if model.samples > 1 else np.inf
             words = (
@@ -82,7 +82,7 @@ def _pairs(process: Process, model: StepResponseModel) -> list[Finding]:
 
 def _horizons(process: Process, model: StepResponseModel) -> list[Finding]:
     structure = process.structure()
-    longest = max((row.time for row in settling(model) if row.settled), default=0.0)
+    longest = max((row.settling_time for row in settling(model) if row.settled), default=0.0)
     ahead = structure.prediction_horizon * process.dt
     subject = "prediction_horizon"
     if ahead < longest:

@@ -9,7 +9,6 @@ import pytest
 from jaxmpc.problem.declared import declared
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
-from studies.definition.fields import study_fields
 from studies.thesis.well import WELL
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"

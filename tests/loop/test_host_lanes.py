@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from jaxmpc.loop.reference import Reference
 
 from identify.fmu import FmuPlant
 from jaxmpc import status
@@ -11,7 +12,6 @@ from jaxmpc.errors import PlantError
 from jaxmpc.loop import host_lanes
 from jaxmpc.loop.host_lanes import simulate_host_lanes
 from jaxmpc.loop.inputs import Sweep
-from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.model.step_response import make_model
 from jaxmpc.problem.structure import Structure

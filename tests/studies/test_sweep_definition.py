@@ -12,7 +12,6 @@ from jaxmpc.errors import InputError
 from jaxmpc.process.well.equations import WellParameters
 from studies import load
 from studies.definition.estimate import MODEL_SECONDS
-from studies.definition.fields import study_fields
 from studies.definition.models import identify_models
 from studies.definition.sweep import StudyDefinition, load_definition, shipped_studies
 from studies.load import load_study

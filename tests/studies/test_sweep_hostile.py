@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from jaxmpc.errors import InputError
 from studies.definition.axes import MOST
-from studies.definition.fields import study_fields
 from studies.definition.sweep import StudyDefinition, load_definition
 from studies.load import expand
 
