@@ -274,7 +274,7 @@ def _number(field: str, preset: dict[str, Any], name: str) -> float:
     """A preset's value of a field, or what holds where it says nothing."""
     value = preset.get(field)
     value = value.get(name) if isinstance(value, dict) else value
-    return TUNING[field].default if value is None else value
+    return float(TUNING[field].default if value is None else value)
 
 
 # ----------------------------------------------------------------------------------------- plant and disturbances
@@ -298,7 +298,7 @@ def _plant(settings: Settings) -> dict[str, np.ndarray]:
         return out
     plant = open_plant(process, name)
     try:
-        plant.replaced(out)
+        plant.replaced({key: np.broadcast_to(values, settings.count) for key, values in out.items()})
     except InputError as error:
         raise _located(settings, plant, out, error) from None
     finally:
