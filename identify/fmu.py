@@ -26,6 +26,7 @@ from identify.fmu_process import TIME_LIMIT, FmuProcess
 from identify.fmu_source import MODEL_IDENTIFIER, fmu_files
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.files import write_atomically
+from jaxmpc.process.plant import Steady
 from jaxmpc.process.well.choke import CHOKES, check_choke
 from jaxmpc.process.well.equations import (
     DEFAULT_CHOKE,
@@ -36,7 +37,7 @@ from jaxmpc.process.well.equations import (
     WellParameters,
     check_parameters,
 )
-from jaxmpc.process.well.plant import STATE_SCALE, WellOutputs, check_inputs
+from jaxmpc.process.well.plant import STATE_SCALE, WellOutputs, WellPlant, check_inputs
 from jaxmpc.programs.cache import cache_folder, read_sealed, sealed
 from jaxmpc.programs.interrupts import in_the_end, run_program
 
@@ -190,6 +191,8 @@ class FmuPlant:
         PlantError: if the FMU crashes, hangs or reports an error; so do `init`, `step`, `measure` and `x`.
     """
 
+    signals, test_steps, check_mv = WellPlant.signals, WellPlant.test_steps, staticmethod(WellPlant.check_mv)
+
     def __init__(
         self,
         path: str | Path | None = None,
@@ -256,6 +259,15 @@ class FmuPlant:
         return self.measure()
 
     reset = init
+
+    @property
+    def identity(self) -> tuple[str, str]:
+        """Its kind, and its token."""
+        return "fmu", self.token
+
+    def steady(self, mv, disturbance: float = 0.0) -> Steady:
+        """Start in the steady state of a choke [%] and a lift [m3/h], as `init`; the FMU keeps its state."""
+        return Steady(None, self.init(float(mv[0]), float(mv[1]), disturbance), self.settled)
 
     def _start(self, inputs: dict[str, float], x) -> None:
         self._fmu.start({} if x is None else _floats(STATE_NAMES, x))

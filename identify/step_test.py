@@ -1,7 +1,8 @@
 """Identification by step tests: thesis 4.1, (4.2)-(4.3).
 
 The plant is settled at a working point, each MV is stepped alone and held, and the responses are divided by
-the step. Any plant with `init`, `step` and `measure` will do: the JAX well and the FMU give the same model.
+the step. Any plant will do: a `JaxPlant` runs in compiled pieces, any other is stepped on the host
+(`identify.working_point` lists what a plant may have beyond `init` and `step`).
 """
 
 from __future__ import annotations
@@ -13,19 +14,13 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
+from identify.working_point import Values, check_mv, identity, in_order, point_of, signals_of, start
+from jaxmpc.check import is_count
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import StepResponseModel, make_model
-from jaxmpc.process.well.equations import (
-    CV_NAMES,
-    CV_UNITS,
-    DEFAULT_CHOKE,
-    DEFAULT_LIFT,
-    MV_NAMES,
-    MV_UNITS,
-    well_hash,
-)
-from jaxmpc.process.well.plant import WellPlant, check_inputs
+from jaxmpc.process.plant import JaxPlant, Signals, disturbances_of
 
 SETTLE_SAMPLES = 60  # held at the working point before a step
 PIECE = 64  # samples of one call, so that all lengths are run by one program
@@ -67,13 +62,6 @@ def settling(model: StepResponseModel) -> list[Settling]:
     return found
 
 
-def identity(plant: Any) -> tuple[str, str]:
-    """What a plant is, ``jax`` or ``fmu``, and a digest of everything that decides its responses."""
-    if isinstance(plant, WellPlant):
-        return "jax", well_hash(plant.parameters)
-    return "fmu", plant.token
-
-
 def settling_notes(model: StepResponseModel) -> list[str]:
     """One sentence per response that had not settled by sample N; empty if all had."""
     return [
@@ -85,25 +73,23 @@ def settling_notes(model: StepResponseModel) -> list[str]:
 
 
 def apply_sequence(
-    plant: Any, choke: float, lift: float, demands: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Start a plant at a working point, choke [%] and lift [m3/h], and apply demands ``"sample 2"`` to it.
-
-    The plant is a `WellPlant`, or any on the host with ``init(choke, lift)`` and ``step(mv)``.
+    plant: Any, state: Any, demands: Float[np.ndarray, "sample mv"]
+) -> tuple[Float[np.ndarray, "sample cv"], Float[np.ndarray, "sample mv"]]:
+    """Apply demands [MV unit] to a plant, from the state of a `JaxPlant`; any other goes on from where it stands.
 
     Returns:
-        ``(cv, mv)``: measurements and applied inputs at the end of each sample, both ``"sample 2"``.
+        ``(cv, mv)``: measurements and applied inputs at the end of each sample.
     """
-    if isinstance(plant, WellPlant):
-        state, pieces = plant.init(choke, lift), []
+    if isinstance(plant, JaxPlant):
+        pieces = []
         held = np.pad(demands, ((0, -len(demands) % PIECE), (0, 0)), mode="edge")
         for begin in range(0, len(held), PIECE):
             state, outputs = _run(plant, state, held[begin : begin + PIECE])
             pieces.append((np.asarray(outputs.cv), np.asarray(outputs.mv)))
         cv, mv = (np.concatenate(parts)[: len(demands)] for parts in zip(*pieces, strict=True))
         return cv, mv
-    plant.init(choke, lift)
-    outputs = [plant.step(demand) for demand in demands]
+    undisturbed = np.zeros(len(disturbances_of(plant)))
+    outputs = [plant.step(demand, undisturbed) for demand in demands]
     return np.array([o.cv for o in outputs]), np.array([o.mv for o in outputs])
 
 
@@ -113,20 +99,24 @@ def _run(plant, state, demands):
 
 
 def identify_step_response(
-    plant: Any = None,
-    choke: float = DEFAULT_CHOKE,
-    lift: float = DEFAULT_LIFT,
-    steps: tuple[float, float] = (2.0, 100.0),
+    plant: Any,
+    working_point: Values | None = None,
+    steps: Values | None = None,
     samples: int = 250,
+    *,
+    both_ways: bool = False,
+    signals: Signals | None = None,
 ) -> StepResponseModel:
     """Identify a step-response model by stepping each MV alone, (4.2)-(4.3).
 
     Args:
-        plant: a `WellPlant` (the default) or an `identify.fmu.FmuPlant`; its `dt` is the model's.
-        choke: position at the working point [%].
-        lift: lift rate at the working point [m3/h].
-        steps: of the choke [%] and of the lift [m3/h], not zero.
+        plant: a `JaxPlant` or a stateful one; its `dt` is the model's.
+        working_point: the MVs where the steps begin [MV unit], by name or in MV order; the plant's own by default.
+        steps: of the MVs [MV unit], by name or in MV order, not zero; the plant's `test_steps` by default.
         samples: N, the number of coefficients; S(1) is the change at the first sample after the step.
+        both_ways: whether each MV is stepped in both directions and the model is the mean of both, the central difference
+            with an error of second order in the step.
+        signals: names and units; the plant's own by default.
 
     Returns:
         The model, with units, working point (MVs and settled CVs), and as provenance the kind and hash of the
@@ -134,42 +124,61 @@ def identify_step_response(
 
     Raises:
         InputError: for inputs outside their range, before anything is simulated; or if the actuator does not
-            make the step (a step choke needs at least 1.6 %, and goes to the nearest 2 % position).
+            make the step (one that moves in whole steps goes to the nearest position).
     """
-    plant = WellPlant() if plant is None else plant
-    check_inputs(choke, lift)
-    if isinstance(samples, bool) or not isinstance(samples, int) or samples < 1:
+    signals = signals_of(plant, signals)
+    point = point_of(plant, signals, working_point)
+    if not is_count(samples):
         raise InputError("samples", samples, "a whole number of 1 or more")
-    if np.shape(steps) != (2,) or not np.isfinite(steps).all() or 0.0 in tuple(steps):
-        raise InputError("steps", steps, "two finite steps that are not zero: choke [%] and lift [m3/h]")
-    check_inputs(choke + steps[0], lift + steps[1])
-
-    point = np.array([choke, lift], dtype=np.float64)
-    responses, base = [], np.zeros(2)
-    for j, step in enumerate(steps):
-        demands = np.tile(point, (SETTLE_SAMPLES + samples, 1))
-        demands[SETTLE_SAMPLES:, j] += step
-        cv, mv = apply_sequence(plant, choke, lift, demands)
-        made = mv[-1] - point
-        if abs(made[j] - step) > 1e-9 * max(1.0, abs(step)):
-            expected = f"a step that the actuator makes ({MV_NAMES[j]} moved {made[j]})"
-            raise InputError(f"steps[{j}]", step, expected)
-        base = cv[SETTLE_SAMPLES - 1]
-        responses.append((cv[SETTLE_SAMPLES:] - base).T / step)
+    change = in_order("steps", getattr(plant, "test_steps", None) if steps is None else steps, signals)
+    if not change.all():
+        j = int(np.argmin(np.abs(change)))
+        raise InputError(f"steps.{signals.mv_names[j]}", 0.0, "a step that is not zero")
+    ways = [change, -change] if both_ways else [change]
+    for way in ways:
+        check_mv(plant, point + way)
+    tests = [_responses(plant, signals, point, way, samples) for way in ways]
+    coefficients = tests[0][1] if len(tests) == 1 else 0.5 * (tests[0][1] + tests[1][1])
     kind, digest = identity(plant)
     facts = {
         "plant": kind,
         "plant_hash": digest,
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "steps": [float(step) for step in steps],
+        "steps": np.concatenate(ways).tolist(),
     }
-    found = dict(zip((*MV_NAMES, *CV_NAMES), (choke, lift, *base.tolist()), strict=True))
-    units: dict[str, Any] = {"cv_units": CV_UNITS, "mv_units": MV_UNITS}
-    coefficients = np.stack(responses, axis=1)
+    names, values = (*signals.mv_names, *signals.cv_names), (*point.tolist(), *tests[0][0].tolist())
     model = make_model(
-        coefficients, plant.dt, CV_NAMES, MV_NAMES, **units, working_point=found, provenance=facts
+        coefficients,
+        plant.dt,
+        signals.cv_names,
+        signals.mv_names,
+        cv_units=signals.cv_units,
+        mv_units=signals.mv_units,
+        working_point=dict(zip(names, values, strict=True)),
+        provenance=facts,
     )
     notes = tuple(settling_notes(model))
     return dataclasses.replace(
         model, provenance=(*model.provenance, ("settled", not notes), ("notes", notes))
     )
+
+
+def _responses(
+    plant: Any, signals: Signals, point: np.ndarray, steps: np.ndarray, samples: int
+) -> tuple[Float[np.ndarray, " cv"], Float[np.ndarray, "cv mv n"]]:
+    """CVs settled at a working point, and S(1)..S(N) from a step of each MV alone."""
+    responses, base = [], np.zeros(0)
+    for j, (name, step) in enumerate(zip(signals.mv_names, steps, strict=True)):
+        state, settled = start(plant, point)
+        hold = SETTLE_SAMPLES if settled else SETTLE_SAMPLES + samples
+        demands = np.tile(point, (hold + samples, 1))
+        demands[hold:, j] += step
+        cv, mv = apply_sequence(plant, state, demands)
+        made = mv[-1, j] - point[j]
+        if abs(made - step) > 1e-9 * max(1.0, abs(step)):
+            raise InputError(
+                f"steps.{name}", float(step), f"a step that the actuator makes ({name} moved {made})"
+            )
+        base = cv[hold - 1]
+        responses.append((cv[hold:] - base).T / step)
+    return base, np.stack(responses, axis=1)

@@ -22,6 +22,23 @@ class Outputs(NamedTuple):
     mv: Any  # ``"mv"``, where the actuators stand [MV unit]
 
 
+class Signals(NamedTuple):
+    """Names and units of the CVs and MVs of a plant, in the order of its vectors; units may be empty."""
+
+    cv_names: tuple[str, ...]
+    mv_names: tuple[str, ...]
+    cv_units: tuple[str, ...] = ()
+    mv_units: tuple[str, ...] = ()
+
+
+class Steady(NamedTuple):
+    """A steady state of a plant with held MVs."""
+
+    state: Any  # of a `JaxPlant`; None where the plant keeps its own, and stands there then
+    outputs: Any  # what it measures there, as `Outputs`
+    converged: Any  # whether it is one; else the last state on the way to it
+
+
 class PlantOutputs(Protocol):
     """What a plant measures at the end of a sample; more than `Outputs` is allowed."""
 

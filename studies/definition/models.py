@@ -8,11 +8,12 @@ from identify.step_test import identify_step_response
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.well.equations import WellParameters
-from jaxmpc.process.well.plant import check_inputs, steady_state_of
+from jaxmpc.process.well.grids import TEST_STEPS
+from jaxmpc.process.well.plant import WellPlant, check_inputs, steady_state_of
 from studies.definition.refusing import require
 
 Point = tuple[float, float]
-STEPS = (2.0, 100.0)  # of the choke [%] and of the gas lift [m3/h]
+STEPS = TEST_STEPS  # of the choke [%] and of the gas lift [m3/h]
 SAMPLES = 250  # coefficients of a model
 
 
@@ -42,7 +43,7 @@ def identify_models(
         require(settles, here, "no steady state", "a working point at which the well settles")
     out = {}
     for choke, lift in wanted:
-        out[choke, lift] = identify_step_response(None, choke, lift, STEPS, samples)
+        out[choke, lift] = identify_step_response(WellPlant(), (choke, lift), STEPS, samples)
         if progress is not None:
             progress(len(out), len(wanted))
     return out

@@ -26,8 +26,9 @@ from jaxmpc.loop.targets import simulate_with_targets
 from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure
+from jaxmpc.process.well.grids import LIFT_RANGES, STEADY_MAP
 from jaxmpc.steady.map import SteadyMap
-from jaxmpc.steady.optimise import LIFT_RANGES, Targets, optimise
+from jaxmpc.steady.optimise import Targets, optimise
 from studies.definition import presets
 from studies.definition.comparison import PlantKind
 from studies.definition.presets import CHOKE, GAS, LIFT, OIL
@@ -66,7 +67,14 @@ def demands(quick: bool = False) -> Reference:
 def targets_of(steady: SteadyMap, demanded: Reference, deadzone: np.ndarray) -> list[Targets]:
     """What the real-time optimisation makes of each demand: the most profitable point within its deadzone [CV unit]."""
     return [
-        optimise(steady, PRICES, rates - deadzone, rates + deadzone, choke_step=presets.CHOKE_STEP)
+        optimise(
+            steady,
+            PRICES,
+            rates - deadzone,
+            rates + deadzone,
+            mv_ranges={CHOKE: [(0.0, 100.0)], LIFT: LIFT_RANGES},
+            mv_steps={CHOKE: presets.CHOKE_STEP},
+        )
         for rates in demanded.setpoints
     ]
 
@@ -95,7 +103,7 @@ def run_rto(
     with locked(folder / RESULTS):
         make_plant, facts = plant_factory(plant, say)
         with closing(make_plant("continuous")) as tested:
-            model, steady = identify_step_response(tested), steady_map(tested)
+            model, steady = identify_step_response(tested), steady_map(tested, STEADY_MAP)
         model.save(folder / "model.json")
         steady.save(folder / "steady_map.json")
         structure = presets.structure(integer=True)
@@ -192,7 +200,7 @@ def _shared(
         "profit": labelled(profit, ("demand",), "steady profit of the target", "1/h"),
         "tuning_deadzone": labelled(half, ("controller", "cv"), "half width of the deadzone", "cv_unit"),
         **texts,
-        "map_rate": over_inputs("map", steady.choke, steady.lift, steady.cv, "steady CV", "cv_unit"),
+        "map_rate": over_inputs("map", steady.grid, steady.cv, "steady CV", "cv_unit"),
     }
 
 
