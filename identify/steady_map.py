@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from identify.sweep import steady_sweep
-from identify.working_point import Values, identity
+from identify.working_point import Values, facts_of
 from jaxmpc.process.plant import Signals
 from jaxmpc.steady.map import SteadyMap
 
@@ -38,12 +38,12 @@ def steady_map(
     """
     sweep = steady_sweep(plant, grid, working_point=working_point, signals=signals)
     units = dict(zip(sweep.signals.mv_names, sweep.signals.mv_units, strict=False))
-    kind, digest = identity(plant)
+    facts = facts_of(plant)
     return SteadyMap(
         grid=sweep.grid,
         cv=np.where(sweep.converged, sweep.cv, np.nan),
         cv_names=sweep.signals.cv_names,
         cv_units=sweep.signals.cv_units,
         mv_units=tuple(units.get(name, "") for name in sweep.grid),
-        provenance={"plant": kind, "hash": digest},
+        provenance={"plant": facts["kind"], "hash": facts["hash"]},
     )

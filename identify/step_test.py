@@ -10,15 +10,16 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import itertools
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from identify.working_point import Values, check_mv, identity, in_order, point_of, signals_of, start
-from jaxmpc.check import is_count
-from jaxmpc.errors import InputError
+from identify.working_point import Values, check_mv, facts_of, in_order, point_of, signals_of, start
+from jaxmpc.check import is_count, is_number
+from jaxmpc.errors import InputError, near
 from jaxmpc.model.step_response import StepResponseModel, make_model
 from jaxmpc.process.plant import JaxPlant, Signals, disturbances_of
 
@@ -31,7 +32,7 @@ class Settling(NamedTuple):
     """How far one response had come by the last sample.
 
     Attributes:
-        cv, mv: names.
+        cv, mv: names, of the MV or DV that was stepped.
         settled: whether it moved by less than 1 % of its largest value over the last tenth of the samples.
         movement: that movement as a share of the largest value [1].
         gain: S(N) [CV unit per MV unit].
@@ -51,8 +52,10 @@ class Settling(NamedTuple):
 def settling(model: StepResponseModel) -> list[Settling]:
     """Whether each response of a model had settled by its last sample; see `Settling`."""
     found = []
-    for (i, cv), (j, mv) in itertools.product(enumerate(model.cv_names), enumerate(model.mv_names)):
-        s = np.asarray(model.coefficients[i, j])
+    inputs = (*model.mv_names, *model.dv_names)
+    responses = np.concatenate([model.coefficients, model.dv_coefficients], axis=1)
+    for (i, cv), (j, mv) in itertools.product(enumerate(model.cv_names), enumerate(inputs)):
+        s = responses[i, j]
         gain, peak = float(s[-1]), float(s[np.argmax(np.abs(s))])
         tail = s[-max(2, len(s) // 10) :]
         movement = float(np.ptp(tail) / max(abs(peak), 1e-300)) if len(s) > 1 else 1.0
@@ -73,29 +76,33 @@ def settling_notes(model: StepResponseModel) -> list[str]:
 
 
 def apply_sequence(
-    plant: Any, state: Any, demands: Float[np.ndarray, "sample mv"]
+    plant: Any,
+    state: Any,
+    demands: Float[np.ndarray, "sample mv"],
+    disturbances: Float[np.ndarray, "sample disturbance"],
 ) -> tuple[Float[np.ndarray, "sample cv"], Float[np.ndarray, "sample mv"]]:
-    """Apply demands [MV unit] to a plant, from the state of a `JaxPlant`; any other goes on from where it stands.
+    """Apply demands [MV unit] and disturbances to a plant, from the state of a `JaxPlant`; any other goes on from its own.
 
     Returns:
         ``(cv, mv)``: measurements and applied inputs at the end of each sample.
     """
     if isinstance(plant, JaxPlant):
         pieces = []
-        held = np.pad(demands, ((0, -len(demands) % PIECE), (0, 0)), mode="edge")
+        filled = ((0, -len(demands) % PIECE), (0, 0))
+        held, off = np.pad(demands, filled, mode="edge"), np.pad(disturbances, filled)
         for begin in range(0, len(held), PIECE):
-            state, outputs = _run(plant, state, held[begin : begin + PIECE])
+            own = slice(begin, begin + PIECE)
+            state, outputs = _run(plant, state, held[own], off[own])
             pieces.append((np.asarray(outputs.cv), np.asarray(outputs.mv)))
         cv, mv = (np.concatenate(parts)[: len(demands)] for parts in zip(*pieces, strict=True))
         return cv, mv
-    undisturbed = np.zeros(len(disturbances_of(plant)))
-    outputs = [plant.step(demand, undisturbed) for demand in demands]
+    outputs = [plant.step(demand, off) for demand, off in zip(demands, disturbances, strict=True)]
     return np.array([o.cv for o in outputs]), np.array([o.mv for o in outputs])
 
 
 @jax.jit
-def _run(plant, state, demands):
-    return plant.run(state, demands)
+def _run(plant, state, demands, disturbances):
+    return plant.run(state, demands, disturbances)
 
 
 def identify_step_response(
@@ -105,17 +112,20 @@ def identify_step_response(
     samples: int = 250,
     *,
     both_ways: bool = False,
+    disturbance_steps: Mapping[str, float] | None = None,
     signals: Signals | None = None,
 ) -> StepResponseModel:
-    """Identify a step-response model by stepping each MV alone, (4.2)-(4.3).
+    """Identify a step-response model by stepping each MV and disturbance alone, (4.2)-(4.3).
 
     Args:
         plant: a `JaxPlant` or a stateful one; its `dt` is the model's.
         working_point: the MVs where the steps begin [MV unit], by name or in MV order; the plant's own by default.
         steps: of the MVs [MV unit], by name or in MV order, not zero; the plant's `test_steps` by default.
         samples: N, the number of coefficients; S(1) is the change at the first sample after the step.
-        both_ways: whether each MV is stepped in both directions and the model is the mean of both, the central difference
+        both_ways: whether each input is stepped in both directions and the model is the mean of both, the central difference
             with an error of second order in the step.
+        disturbance_steps: by name, of the disturbances of the plant that are measured disturbances (DVs) of the model; not
+            zero.
         signals: names and units; the plant's own by default.
 
     Returns:
@@ -134,21 +144,24 @@ def identify_step_response(
     if not change.all():
         j = int(np.argmin(np.abs(change)))
         raise InputError(f"steps.{signals.mv_names[j]}", 0.0, "a step that is not zero")
-    ways = [change, -change] if both_ways else [change]
+    sizes = _disturbance_sizes(plant, disturbance_steps or {})
+    ways = (1.0, -1.0) if both_ways else (1.0,)
     for way in ways:
-        check_mv(plant, point + way)
-    tests = [_responses(plant, signals, point, way, samples) for way in ways]
+        check_mv(plant, point + way * change)
+    tests = [_responses(plant, signals, point, way * change, way * sizes, samples) for way in ways]
+    base = tests[0][0]
     coefficients = tests[0][1] if len(tests) == 1 else 0.5 * (tests[0][1] + tests[1][1])
-    kind, digest = identity(plant)
+    known, dvs = facts_of(plant), np.flatnonzero(sizes)
+    units = signals.disturbance_units
     facts = {
-        "plant": kind,
-        "plant_hash": digest,
+        "plant": known["kind"],
+        "plant_hash": known["hash"],
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "steps": np.concatenate(ways).tolist(),
+        "steps": np.concatenate([way * np.append(change, sizes[dvs]) for way in ways]).tolist(),
     }
-    names, values = (*signals.mv_names, *signals.cv_names), (*point.tolist(), *tests[0][0].tolist())
+    names, values = (*signals.mv_names, *signals.cv_names), (*point.tolist(), *base.tolist())
     model = make_model(
-        coefficients,
+        coefficients[:, : len(change)],
         plant.dt,
         signals.cv_names,
         signals.mv_names,
@@ -156,6 +169,9 @@ def identify_step_response(
         mv_units=signals.mv_units,
         working_point=dict(zip(names, values, strict=True)),
         provenance=facts,
+        dv_coefficients=coefficients[:, len(change) :],
+        dv_names=[disturbances_of(plant)[k] for k in dvs],
+        dv_units=[units[k] for k in dvs] if units else (),
     )
     notes = tuple(settling_notes(model))
     return dataclasses.replace(
@@ -163,22 +179,38 @@ def identify_step_response(
     )
 
 
+def _disturbance_sizes(plant: Any, steps: Mapping[str, float]) -> Float[np.ndarray, " disturbance"]:
+    """Step of each disturbance of the plant, 0 for those that are not stepped."""
+    names = disturbances_of(plant)
+    sizes = np.zeros(len(names))
+    for name, size in steps.items():
+        field = f"disturbance_steps.{name}"
+        if name not in names:
+            expected = f"one of the disturbances of the plant: {', '.join(names) or 'it has none'}"
+            raise InputError(field, size, expected, near(name, names))
+        if not is_number(size) or size == 0.0:
+            raise InputError(field, size, "a finite step that is not zero")
+        sizes[names.index(name)] = size
+    return sizes
+
+
 def _responses(
-    plant: Any, signals: Signals, point: np.ndarray, steps: np.ndarray, samples: int
-) -> tuple[Float[np.ndarray, " cv"], Float[np.ndarray, "cv mv n"]]:
-    """CVs settled at a working point, and S(1)..S(N) from a step of each MV alone."""
+    plant: Any, signals: Signals, point: np.ndarray, changes: np.ndarray, sizes: np.ndarray, samples: int
+) -> tuple[Float[np.ndarray, " cv"], Float[np.ndarray, "cv input n"]]:
+    """CVs settled at a working point, and S(1)..S(N) from a step of each MV, then of each disturbance with a size, alone."""
     responses, base = [], np.zeros(0)
-    for j, (name, step) in enumerate(zip(signals.mv_names, steps, strict=True)):
+    count, steps = len(point), np.append(changes, sizes)
+    for j in np.flatnonzero(steps):
         state, settled = start(plant, point)
         hold = SETTLE_SAMPLES if settled else SETTLE_SAMPLES + samples
-        demands = np.tile(point, (hold + samples, 1))
-        demands[hold:, j] += step
-        cv, mv = apply_sequence(plant, state, demands)
-        made = mv[-1, j] - point[j]
-        if abs(made - step) > 1e-9 * max(1.0, abs(step)):
-            raise InputError(
-                f"steps.{name}", float(step), f"a step that the actuator makes ({name} moved {made})"
-            )
+        inputs = np.tile(np.append(point, np.zeros_like(sizes)), (hold + samples, 1))
+        inputs[hold:, j] += steps[j]
+        cv, mv = apply_sequence(plant, state, inputs[:, :count], inputs[:, count:])
+        made = mv[-1] - point
+        if j < count and abs(made[j] - steps[j]) > 1e-9 * max(1.0, abs(steps[j])):
+            name = signals.mv_names[j]
+            expected = f"a step that the actuator makes ({name} moved {made[j]})"
+            raise InputError(f"steps.{name}", float(steps[j]), expected)
         base = cv[hold - 1]
-        responses.append((cv[hold:] - base).T / step)
+        responses.append((cv[hold:] - base).T / steps[j])
     return base, np.stack(responses, axis=1)

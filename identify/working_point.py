@@ -3,12 +3,12 @@
 `identify.step_test`, `identify.sweep` and `identify.schedule` call it. A plant need not have more than `init` and `step`;
 of the following, what it has is used.
 
-- `signals`: names and units of its CVs and MVs.
+- `signals`: names and units of its CVs, MVs and disturbances, as `jaxmpc.process.plant.Signals`.
 - ``steady(mv)``: the steady state of held MVs, as `jaxmpc.process.plant.Steady`. Without it a plant is held at a working
   point that is not its own until a step response would have settled.
 - ``check_mv(mv)``: an `InputError` for MVs outside their range, each of them one value or an array.
 - `test_steps`: step of each MV that suits a step test.
-- `identity`: its kind and a digest of everything that decides its responses.
+- ``facts()``: its `kind` and a `hash` of everything that decides its responses.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from jaxmpc.process.plant import JaxPlant, Signals
 Values = Mapping[str, float] | Sequence[float] | Float[np.ndarray, " mv"]
 
 
-def identity(plant: Any) -> tuple[str, str]:
-    """What a plant is, for example ``jax`` or ``fmu``, and a digest of what decides its responses; empty if it has none."""
-    return getattr(plant, "identity", (type(plant).__name__, ""))
+def facts_of(plant: Any) -> dict[str, Any]:
+    """What a plant is: `kind`, for example ``jax`` or ``fmu``, and `hash`, empty for a plant that has no `facts`."""
+    return plant.facts() if hasattr(plant, "facts") else {"kind": type(plant).__name__, "hash": ""}
 
 
 def signals_of(plant: Any, given: Signals | None = None) -> Signals:

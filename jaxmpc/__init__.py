@@ -28,9 +28,11 @@ if not _os.environ.get("JAXMPC_NO_JIT_CACHE"):
 _watch()
 
 _HOME_OF = {
+    "Actuator": "process.actuator",
     "Controller": "controller.controller",
     "Controllers": "controller.controller",
     "InputError": "errors",
+    "ModelPlant": "process.model_plant",
     "Reference": "loop.reference",
     "SensorFault": "controller.measurement",
     "SteadyMap": "steady.map",

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from identify.fmu import FmuPlant, build_fmu
 from identify.schedule import identify_schedule
 from identify.step_test import identify_step_response, settling_notes
 from identify.sweep import steady_sweep
-from identify.working_point import identity
+from identify.well_fmu import WellFmuPlant, build_fmu
 from jaxmpc.process.well.grids import SCHEDULE, SWEEP
 from jaxmpc.process.well.plant import WellPlant
 from studies.definition.comparison import PLANTS, ComparisonDefinition, PlantKind
@@ -89,13 +88,12 @@ def plant_factory(
 ) -> tuple[Callable[[str], Any], dict[str, Any]]:
     """How to make the plant with a given actuator, and the facts that identify it."""
     if kind == "jax":
-        known, digest = identity(WellPlant())
-        return (lambda actuator: WellPlant(actuator=actuator)), {"kind": known, "hash": digest}
+        return (lambda actuator: WellPlant(actuator=actuator)), WellPlant().facts()
     path = build_fmu()
     say(f"FMU: {path}")
-    with FmuPlant(path) as built:
-        facts = {"kind": "fmu", "hash": built.token, "fmi": built.fmi}
-    return (lambda actuator: FmuPlant(path, actuator=actuator)), facts
+    with WellFmuPlant(path) as built:
+        facts = built.facts()
+    return (lambda actuator: WellFmuPlant(path, actuator=actuator)), facts
 
 
 def steady_variables(plant: Any) -> dict[str, xr.DataArray]:

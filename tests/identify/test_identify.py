@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from identify.fmu import FmuPlant
 from identify.schedule import identify_schedule
 from identify.step_test import identify_step_response, settling, settling_notes
 from identify.sweep import steady_sweep
 from identify.well_fit import StepData, fit_well, load_step_data, main
+from identify.well_fmu import WellFmuPlant
 from jaxmpc.controller.schedule import ModelSchedule
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.model.step_response import StepResponseModel
@@ -27,7 +27,11 @@ DATA = Path(__file__).parents[2].parent / "shared" / "data" / "single_well_step_
 
 
 TANKS = Signals(
-    ("level", "heat", "flow"), ("pump", "steam", "valve"), ("m", "C", "m3/h"), ("m3/h", "kg/h", "%")
+    ("level", "heat", "flow"),
+    ("pump", "steam", "valve"),
+    ("m", "C", "m3/h"),
+    ("m3/h", "kg/h", "%"),
+    ("mm/h",),
 )
 GAIN = np.array([[0.1, 0.0, -0.2], [-0.3, 0.02, 0.0], [0.5, 0.0, 0.4]])  # CV unit per MV unit
 OWN = np.array([10.0, 200.0, 40.0])  # where they start
@@ -61,7 +65,7 @@ class Tanks(JaxPlant):
 class OtherTanks:
     """The same, stepped on the host, without names and steady states."""
 
-    dt = 5.0
+    dt, disturbance_names = 5.0, ("rain",)
 
     def __init__(self):
         self.plant = Tanks()
@@ -79,13 +83,21 @@ class OtherTanks:
 def test_a_plant_of_any_size_and_kind_gives_its_gains_and_time_constant(plant):
     point = {"steam": 250.0, "valve": 20.0, "pump": 11.0}
     found = identify_step_response(
-        plant, point, {"pump": 1.0, "steam": -5.0, "valve": 2.0}, 120, signals=TANKS
+        plant,
+        point,
+        {"pump": 1.0, "steam": -5.0, "valve": 2.0},
+        120,
+        disturbance_steps={"rain": 4.0},
+        signals=TANKS,
     )
     rise = 1.0 - np.exp(-5.0 * np.arange(1, 121) / 60.0)
     np.testing.assert_allclose(
         found.coefficients, GAIN[..., None] * rise, atol=1e-5
     )  # held 15 time constants
+    np.testing.assert_allclose(found.dv_coefficients, np.tile(rise, (3, 1, 1)), atol=1e-5)
     assert (found.cv_names, found.mv_units, found.dt) == (TANKS.cv_names, TANKS.mv_units, 5.0)
+    assert (found.dv_names, found.dv_units) == (("rain",), ("mm/h",))
+    assert dict(found.provenance)["steps"] == (1.0, -5.0, 2.0, 4.0)
     where = dict(found.working_point)
     assert [where[name] for name in TANKS.mv_names] == [11.0, 250.0, 20.0]
     assert [where[name] for name in TANKS.cv_names] == pytest.approx(GAIN @ [1.0, 50.0, -20.0], abs=1e-3)
@@ -141,7 +153,7 @@ def sweep():
 @pytest.fixture(scope="module")
 def fmu():
     try:
-        plant = FmuPlant()
+        plant = WellFmuPlant()
     except MissingToolError as error:
         pytest.skip(str(error))
     with plant:
@@ -222,6 +234,11 @@ def test_model_does_not_depend_on_the_step_size_of_a_linear_plant():
         ({"steps": (2.0, float("nan"))}, "steps.gas_lift"),
         ({"steps": 2.0}, "steps"),
         ({"plant": WellPlant(actuator="step"), "steps": (1.0, 100.0), "samples": 5}, "steps.choke"),
+        ({"disturbance_steps": {"rain": 1.0}}, "disturbance_steps.rain"),
+        (
+            {"disturbance_steps": {"reservoir_pressure_offset": 0.0}},
+            "disturbance_steps.reservoir_pressure_offset",
+        ),
         ({"plant": Tanks()}, "signals"),
         ({"plant": Tanks(), "signals": TANKS}, "steps"),
     ],

@@ -3,7 +3,7 @@
 `WellPlant` integrates the equations of `jaxmpc.process.well.equations` with RK4 between samples, holds its inputs over each
 sample, and moves the choke the way its actuator does. Everything is pure: a batch over states, inputs,
 parameters or disturbances is a `jax.vmap`. The closed loop and the identification call it; the FMU plant of
-`identify.fmu` offers the same steps on the host.
+`identify.well_fmu` offers the same steps on the host.
 """
 
 from __future__ import annotations
@@ -216,7 +216,7 @@ class WellPlant(JaxPlant):
     """
 
     disturbance_names: ClassVar[tuple[str, ...]] = ("reservoir_pressure_offset",)
-    signals: ClassVar[Signals] = Signals(CV_NAMES, MV_NAMES, CV_UNITS, MV_UNITS)
+    signals: ClassVar[Signals] = Signals(CV_NAMES, MV_NAMES, CV_UNITS, MV_UNITS, ("bar",))
     test_steps: ClassVar[tuple[float, ...]] = TEST_STEPS
     parameters: WellParameters = WellParameters()
     dt: float = eqx.field(static=True, default=10.0)
@@ -239,10 +239,9 @@ class WellPlant(JaxPlant):
         """Number of integration steps in one sample."""
         return round(self.dt / self.substep)
 
-    @property
-    def identity(self) -> tuple[str, str]:
-        """Its kind, and a digest of its parameters."""
-        return "jax", well_hash(self.parameters)
+    def facts(self) -> dict[str, str]:
+        """What the plant is, with a digest of its parameters."""
+        return {"kind": "jax", "hash": well_hash(self.parameters)}
 
     @staticmethod
     def check_mv(mv) -> None:
