@@ -20,7 +20,7 @@ from identify.fmu_process import TIME_LIMIT, FmuProcess
 from jaxmpc.check import is_number
 from jaxmpc.errors import InputError, PlantError, near
 from jaxmpc.process.actuator import Actuator
-from jaxmpc.process.plant import Outputs, Parameter, checked_parameters
+from jaxmpc.process.plant import Outputs, Parameter, Signals, checked_parameters
 
 MvActuator = Actuator | tuple[float, float] | None
 
@@ -302,6 +302,13 @@ class FmuPlant:
         }
         start = {**(self._arguments["start"] or {}), **new}
         return FmuPlant(**(self._arguments | {"start": start, "description": self.description}))
+
+    @property
+    def signals(self) -> Signals:
+        """Names and units of its CVs, MVs and disturbances."""
+        names = self.cv_names, self.mv_names, self.disturbance_names
+        units = (tuple(self.description.variables[name].unit or "" for name in some) for some in names)
+        return Signals(self.cv_names, self.mv_names, *units)
 
     def facts(self) -> dict[str, Any]:
         """What the plant is, with a digest of everything that decides its responses."""

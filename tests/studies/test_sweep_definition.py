@@ -12,11 +12,11 @@ from jaxmpc.errors import InputError
 from jaxmpc.process.well.plant import WellPlant
 from studies import load
 from studies.definition.estimate import MODEL_SECONDS
+from studies.definition.fields import study_fields
 from studies.definition.models import identify_models
 from studies.definition.sweep import StudyDefinition, load_definition, shipped_studies
 from studies.load import load_study
 from studies.store import fingerprint
-from studies.definition.fields import study_fields
 from studies.thesis.well import WELL
 
 WEIGHT = "tuning.move_weight.choke"
