@@ -8,6 +8,7 @@ length) is built as typed objects, once per distinct combination.
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -313,11 +314,12 @@ def _located(settings: Settings, plant: Any, given: dict[str, np.ndarray], error
         try:
             plant.replaced({name: float(row(values, k)) for name, values in given.items()})
         except InputError as found:
-            name = found.field.rpartition("plant.")[2]
+            name = found.field.rpartition(".")[2]
             names = [name, *(other for other in given if other != name and other in found.expected)]
             keys = [f"{table}.{n}" for n in names for table in ("plant", "plant_scale")]
             keys = list(filter(settings.given, keys)) or [f"plant.{name}"]
-            expected = f"{found.expected} for {keys[0]}"
+            bare = re.sub(r" (\[[^]]*\]|\(SI units\))", "", found.expected)
+            expected = f"{bare} [{settings.fields[keys[0]].unit}] for {keys[0]}"
             return InputError(settings.table.blame(keys, k), settings.value(keys[0], k), expected)
     return error
 

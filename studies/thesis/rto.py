@@ -102,7 +102,7 @@ def run_rto(
     with locked(folder / RESULTS):
         with closing(open_plant(WELL, plant, actual=False)) as tested:
             model, steady = model_of(WELL, tested), steady_map(tested, STEADY_MAP)
-            facts = plant_facts(WELL, plant, tested)
+            facts = plant_facts(WELL, tested)
         model.save(folder / "model.json")
         steady.save(folder / "steady_map.json")
         structure = WELL.structure(integer=True)

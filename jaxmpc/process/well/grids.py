@@ -14,12 +14,4 @@ STEADY_MAP = {
     "gas_lift": (0.0, 500.0, 1000.0, 1500.0, *(1000.0 * k for k in range(2, 11))),
 }
 
-# The gas gain of the choke falls from 250 to 60 m3/h per % between 7 and 20 %, and more slowly beyond. Linear interpolation
-# between these positions keeps the gains of the choke within 8 % and those of the lift within 12 % of what is
-# identified in between.
-SCHEDULE = {
-    "choke": (4.0, 6.0, 8.0, 10.0, 13.0, 17.0, 22.0, 30.0, 45.0, 60.0, 75.0, 90.0),
-    "gas_lift": (2500.0, 5000.0, 7500.0, 10_000.0),
-}
-
 LIFT_RANGES = ((0.0, 0.0), (2000.0, 10_000.0))  # m3/h: no lift, or enough of it not to slug (thesis 6.7.1)
