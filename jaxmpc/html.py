@@ -154,15 +154,18 @@ def step_response(model: Any) -> str:
         steps = np.zeros(())
     if steps.ndim != 3:
         return card("Step-response model", facts(known | {"coefficients": number(model.coefficients)}))
+    steps = np.concatenate([steps, np.asarray(model.dv_coefficients, dtype=float)], axis=1)
     rows = []
     for c, cv in enumerate(model.cv_names):
         row: list[Any] = [named(model.cv_names, model.cv_units, c, "CV")]
-        for m, mv in enumerate(model.mv_names):
-            words = f"{cv} after a unit step of {mv}, {model.samples * model.dt:g} s"
+        for m, moved in enumerate(model.mv_names + model.dv_names):
+            words = f"{cv} after a unit step of {moved}, {model.samples * model.dt:g} s"
             drawn = chart(words, [Curve(np.append(0.0, steps[c, m]))])
             row.append(Markup(f"{drawn}{escape('settles at ' + number(steps[c, m, -1]))}"))
         rows.append(row)
     head = ["", *(named(model.mv_names, model.mv_units, m, "MV") for m in range(len(model.mv_names)))]
+    dvs = (named(model.dv_names, model.dv_units, d, "DV") for d in range(len(model.dv_names)))
+    head += [f"{name}, measured disturbance" for name in dvs]
     note = facts({"horizon": f"{model.samples * model.dt:g} s, {model.samples} coefficients"} | origin)
     return card("Step-response model", facts(known), table(head, rows), note)
 

@@ -94,7 +94,12 @@ class Scenarios:
                 raise InputError(f"structure[{k}]", names(structure), f"{names(first)} as the first")
             check_size(structure)
         for k, model in enumerate(models):
-            check_match(first, model, f"model[{k}]" if len(models) > 1 else "model")
+            path = f"model[{k}]" if len(models) > 1 else "model"
+            check_match(first, model, path)
+            if model.dv_names != models[0].dv_names:
+                raise InputError(
+                    f"{path}.dv", list(model.dv_names), f"{list(models[0].dv_names)} as the first"
+                )
         number = counts.pop() if counts else 1
         if len({structure.integer_values for structure in structures}) > 1 and len(tunings) == 1:
             tunings = list(tunings) * number
@@ -106,7 +111,7 @@ class Scenarios:
         return cls(
             *map(one_each, (structures, tunings, models)),
             own=_Own(*(len(values) > 1 for values in (structures, tunings, models))),
-            size=functools.reduce(lambda a, b: a | b, (Size.of(*pair) for pair in pairs)),
+            size=functools.reduce(lambda a, b: a | b, (Size.of(*p, len(models[0].dv_names)) for p in pairs)),
             integers=min(rung(most, INTEGERS), INTEGERS[-1]) if most else 0,
             has_limits=any(_limited(tuning) for tuning in tunings),
             switching=any(may_switch(tuning) for tuning in tunings),
@@ -130,6 +135,11 @@ class Scenarios:
     def _coefficients(self) -> list[Any]:
         """Of the models, as long as the shift register."""
         made = {id(model): model.extended(self.size.future) for model in self.models}
+        return [made[id(model)] for model in self.models]
+
+    def _dv_coefficients(self) -> list[Any]:
+        """As `_coefficients`, of the measured disturbances; None where there are none."""
+        made = {id(m): m.extended_dvs(self.size.future) if self.size.dvs else None for m in self.models}
         return [made[id(model)] for model in self.models]
 
     def problems(self, envelope: int) -> Lanes[CondensedQp]:
@@ -181,11 +191,12 @@ class Scenarios:
         restricted = any(s.has_gaps_or_dwell for s in self.structures)
         made = [c.tables(self.integers, restricted) for c in constants]
         tables = lanes_of(made) if self.integers else _no_tables(qps)
-        tunings, coefficients = self.tunings, self._coefficients()
+        shared = lambda trees, own: lanes_of(trees if own else trees[:1])  # noqa: E731
         parts = [
             self.layouts(),
-            lanes_of(tunings if self.own.tuning else tunings[:1]),
-            lanes_of(coefficients if self.own.model else coefficients[:1]),
+            shared(self.tunings, self.own.tuning),
+            shared(self._coefficients(), self.own.model),
+            shared(self._dv_coefficients(), self.own.model),
             qps,
             tables,
         ]

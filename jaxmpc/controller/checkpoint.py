@@ -99,7 +99,7 @@ def _parts(controller: AnyController) -> _Parts:
         names = [controller.structure.mv_names[i] for i in controller.targeted]
         own = {key: getattr(inner.tuning, key)[:cvs] for key in CV_FIELDS}
         assert isinstance(inner.model, StepResponseModel)
-        model = _model(controller.structure, inner.model.coefficients[:cvs])
+        model = _model(controller.structure, inner.model)
         options = {"target_weight": dict(zip(names, weights, strict=True)), **inner.options}
         return _Parts(
             "target", controller.structure, dataclasses.replace(inner.tuning, **own), model, options
@@ -112,9 +112,14 @@ def _parts(controller: AnyController) -> _Parts:
     return _Parts("controller", structure, tuning, controller.model, options)
 
 
-def _model(structure: Structure, coefficients: Any) -> StepResponseModel:
-    s = structure
-    return make_model(coefficients, s.dt, s.cv_names, s.mv_names, cv_units=s.cv_units, mv_units=s.mv_units)
+def _model(structure: Structure, wide: StepResponseModel) -> StepResponseModel:
+    """The model of a structure's CVs, without those of the targets."""
+    s, cvs = structure, structure.cv_count
+    names: dict[str, Any] = dict(
+        cv_units=s.cv_units, mv_units=s.mv_units, dv_names=wide.dv_names, dv_units=wide.dv_units
+    )
+    coefficients, of_dvs = wide.coefficients[:cvs], wide.dv_coefficients[:cvs]
+    return make_model(coefficients, s.dt, s.cv_names, s.mv_names, dv_coefficients=of_dvs, **names)
 
 
 KINDS = {"controller": Controller, "scheduled": ScheduledController, "target": TargetController}

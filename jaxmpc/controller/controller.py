@@ -90,7 +90,7 @@ class Batch:
 
     def __post_init__(self):
         self.count, self.size = self.scenarios.count, self.scenarios.size
-        self.structure = self.scenarios.structures[0]
+        self.structure, self.dv_names = self.scenarios.structures[0], self.scenarios.models[0].dv_names
         self._step = PackedCall(_stepped)
 
     def part(self, index: np.ndarray) -> Batch:
@@ -131,16 +131,15 @@ class Batch:
         return flattened(self.cores)
 
     def init(
-        self, cv: Float[ArrayLike, "scenario cv"], mv: Float[ArrayLike, "scenario mv"]
+        self,
+        cv: Float[ArrayLike, "scenario cv"],
+        mv: Float[ArrayLike, "scenario mv"],
+        dv: Float[ArrayLike, "scenario dv"] | None = None,
     ) -> ControllerState:
-        """State at steady states with measured CVs and present MVs (engineering units).
-
-        Raises:
-            InputError: for other shapes and values that are not finite.
-        """
-        cv, mv = checked_start(self.structure, cv, mv, lanes=self.count)
+        """State at steady states; arguments and errors as in `Controller.init`, the scenario axis first."""
+        start = checked_start(self.structure, cv, mv, dv, dv_names=self.dv_names, lanes=self.count)
         leaves, form = self.flat
-        return jax.tree.map(np.asarray, _init(leaves, cv, mv, form))
+        return jax.tree.map(np.asarray, _init(leaves, *start, form))
 
     def step(
         self,
@@ -149,14 +148,16 @@ class Batch:
         setpoint: Float[ArrayLike, "scenario cv"] | Float[ArrayLike, "scenario horizon cv"],
         mv: Float[ArrayLike, "scenario mv"] | None = None,
         manual: Bool[ArrayLike, "scenario mv"] | None = None,
+        dv: Float[ArrayLike, "scenario dv"] | Float[ArrayLike, "scenario horizon dv"] | None = None,
     ) -> tuple[ControllerState, StepInfo]:
         """One sample of all scenarios; arguments as in `Controller.step`, the scenario axis first."""
-        return self.decide(state, checked(self.structure, cv, setpoint, mv, manual, lanes=self.count))
+        own: dict[str, Any] = dict(dv_names=self.dv_names, lanes=self.count)
+        return self.decide(state, checked(self.structure, cv, setpoint, mv, manual, dv, **own))
 
     def decide(self, state: ControllerState, sample: Sample) -> tuple[ControllerState, StepInfo]:
         """`step` of a checked sample."""
         clock = Clock()
-        sample = sample._replace(setpoint=self.over_horizon(sample.setpoint))
+        sample = self.over_register(sample)
         given = jax.tree.map(np.asarray, (state, sample, self.settings))
         with compiling_for(str(self.size)), in_time(self.time_limit):
             state, info, moment = self._step(self.cores, self.flat, *given)
@@ -181,6 +182,11 @@ class Batch:
     def integer(self) -> Bool[np.ndarray, " scenario"]:
         """Which controllers have integer MVs."""
         return np.array([bool(s.integer_mvs) for s in self.scenarios.structures])
+
+    def over_register(self, sample: Sample) -> Sample:
+        """A sample with setpoints and measured disturbances over the shift register."""
+        dv = None if sample.dv is None else self.over_horizon(sample.dv)
+        return sample._replace(setpoint=self.over_horizon(sample.setpoint), dv=dv)
 
     def over_horizon(self, setpoint: Any) -> Any:
         """Setpoints over the shift register, the last one repeated: ``"scenario future cv"``; NumPy's unless traced."""
@@ -327,9 +333,9 @@ def _said(result: SearchResult, unit: float) -> dict[str, Any]:
 
 
 @functools.partial(jax.jit, static_argnames="form")
-def _init(leaves, cv, mv, form) -> ControllerState:
+def _init(leaves, cv, mv, dv, form) -> ControllerState:
     cores: Lanes[Core] = rebuilt(form, leaves)
-    return cores.vmap(lambda core, *start: core.init(*start), cv, mv)
+    return cores.vmap(lambda core, *start: core.init(*start), cv, mv, dv)
 
 
 @jax.jit
@@ -393,16 +399,24 @@ class Controller:
         """What compiled programs know of the controller."""
         return self.lanes.cores.shared
 
-    def init(self, cv: Float[ArrayLike, " cv"], mv: Float[ArrayLike, " mv"]) -> ControllerState:
-        """State at a steady state with measured CVs and present MVs (engineering units).
+    def init(
+        self,
+        cv: Float[ArrayLike, " cv"],
+        mv: Float[ArrayLike, " mv"],
+        dv: Float[ArrayLike, " dv"] | None = None,
+    ) -> ControllerState:
+        """State at a steady state with measured CVs, present MVs and measured disturbances (engineering units).
+
+        Args:
+            dv: zeros if not given, which counts measured disturbances from the start.
 
         Raises:
             InputError: for other shapes and values that are not finite.
         """
-        cv, mv = checked_start(self.structure, cv, mv)
-        if _traced(self.core, cv, mv):
-            return self.core.init(jnp.asarray(cv), jnp.asarray(mv))
-        return one_lane(self.lanes.init(np.asarray(cv)[None], np.asarray(mv)[None]))
+        start = checked_start(self.structure, cv, mv, dv, dv_names=self.model.dv_names)
+        if _traced(self.core, start):
+            return self.core.init(*jax.tree.map(jnp.asarray, start))
+        return one_lane(self.lanes.init(*jax.tree.map(lambda v: np.asarray(v)[None], start)))
 
     def step(
         self,
@@ -411,6 +425,7 @@ class Controller:
         setpoint: Float[ArrayLike, " cv"] | Float[ArrayLike, "horizon cv"],
         mv: Float[ArrayLike, " mv"] | None = None,
         manual: Bool[ArrayLike, " mv"] | None = None,
+        dv: Float[ArrayLike, " dv"] | Float[ArrayLike, "horizon dv"] | None = None,
     ) -> tuple[ControllerState, StepInfo]:
         """One sample.
 
@@ -418,6 +433,8 @@ class Controller:
             state: from `init` or the previous step.
             cv: measurement now [CV unit]; NaN where there is none.
             setpoint: at j = 1..Hp, or held over the horizon [CV unit].
+            dv: measured disturbances now, or at j = 0..Hp-1, now and as they will be; NaN, and without it, where they
+                are as before [DV unit].
             mv: where the actuators stand before the move [MV unit], NaN where that is not known; without it, demands
                 count as followed.
             manual: MVs that somebody else moves; they are predicted from `mv` and not moved.
@@ -426,13 +443,15 @@ class Controller:
             InputError: for other shapes, setpoints that are not finite, and where double precision is off.
             TypeError: for traced values where there are integer MVs, whose search may go on outside the program.
         """
-        sample = checked(self.structure, cv, setpoint, mv, manual)
+        sample = checked(self.structure, cv, setpoint, mv, manual, dv, dv_names=self.model.dv_names)
         if not _traced(self.core, state, sample):
             lane, of_lane = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (state, sample))
             return self._shown(*one_lane(self.lanes.decide(lane, of_lane)))
         if self.structure.integer_mvs:
             raise TypeError("step() of a controller with integer MVs runs on the host and cannot be traced")
-        sample = sample._replace(setpoint=self.lanes.over_horizon(sample.setpoint[None])[0])
+        sample = jax.tree.map(
+            lambda v: v[0], self.lanes.over_register(jax.tree.map(lambda v: v[None], sample))
+        )
         return self._shown(*self.core.conclude(self.core.consider(state, sample, self.gap)))
 
     def _shown(self, state: ControllerState, info: StepInfo) -> tuple[ControllerState, StepInfo]:

@@ -19,11 +19,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxmpc import status as codes
 from jaxmpc.controller.bias import filter_bias
-from jaxmpc.controller.measurement import GOOD, Sensors
+from jaxmpc.controller.measurement import GOOD, IMPLAUSIBLE, Sensors
 from jaxmpc.controller.sample import Sample
 from jaxmpc.integer.search import Decision, decide
 from jaxmpc.integer.tables import Tables
-from jaxmpc.model.step_response import advance_free_response, shift_free_response
+from jaxmpc.model.step_response import advance_free_response, future_response, shift_free_response
 from jaxmpc.problem.condense import CondensedQp, Matrices, condense, matrices_of
 from jaxmpc.problem.instance import DRIFT, QpInstance, make_instance
 from jaxmpc.problem.layout import Layout, Size
@@ -48,6 +48,7 @@ class ControllerState(eqx.Module):
     warm: WarmStart  # moves and prices of the previous relaxation, shifted; where the next solve starts
     sensors: Sensors  # what the measurements were worth
     manual: Bool[Array, " mv"]  # MVs that somebody else moved at the last sample
+    dv: Float[Array, " dv"] | None = None  # last known measured disturbances; None without any [DV unit]
 
 
 class StepInfo(eqx.Module):
@@ -127,12 +128,16 @@ class Core(eqx.Module):
     tuning: Tuning  # weights and limits
     # of the model, as long as the shift register [CV unit per MV unit]
     coefficients: Float[Array, "cv mv future"]
+    # of measured disturbances; None without any [CV unit per DV unit]
+    dv_coefficients: Float[Array, "cv dv future"] | None
     qp: CondensedQp  # constant part of the problems
     tables: Tables  # what the search for whole moves reads
     size: Size = eqx.field(static=True)  # of the arrays
     switching: bool = eqx.field(static=True)  # whether a CV may be switched off by bad measurements
 
-    def init(self, cv: Float[Array, " cv"], mv: Float[Array, " mv"]) -> ControllerState:
+    def init(
+        self, cv: Float[Array, " cv"], mv: Float[Array, " mv"], dv: Float[Array, " dv"] | None = None
+    ) -> ControllerState:
         """State of a controller that starts in a steady state."""
         s, zeros = self.size, lambda *shape: jnp.zeros(shape)
         cv, mv = jnp.asarray(cv, dtype=jnp.float64), jnp.asarray(mv, dtype=jnp.float64)
@@ -149,6 +154,7 @@ class Core(eqx.Module):
             warm=None,  # pyright: ignore[reportArgumentType]
             sensors=Sensors.fresh(cv),
             manual=jnp.zeros(s.mvs, dtype=bool),
+            dv=None if dv is None else jnp.asarray(dv, dtype=jnp.float64),
         )
         response = jnp.broadcast_to(cv, (s.future, s.cvs))
         cold = cold_start(self.qp, self.instance(state, self.qp, self.tuning, response, response))
@@ -186,12 +192,13 @@ class Core(eqx.Module):
         )
 
     def observe(
-        self, state: ControllerState, cv, mv, manual
+        self, state: ControllerState, cv, mv, manual, dv=None
     ) -> tuple[ControllerState, Float[Array, "future cv"]]:
         """Compare a measurement with its prediction, update the bias, and move on to the next sample.
 
         Args:
             cv: measurement now [CV unit]; a bad one leaves the bias to itself.
+            dv: ``"row dv"``, measured disturbances now and in the samples to come, as far as told [DV unit].
 
         Returns:
             ``(state, free_response)``: the future now starts at the next sample; Lambda (5.13) at j = 1, 2, ....
@@ -208,6 +215,13 @@ class Core(eqx.Module):
         state = eqx.tree_at(
             lambda s: (s.bias, s.bias_raw, s.future, s.sensors), state, (bias, raw, future, sensors)
         )
+        if self.dv_coefficients is None or state.dv is None or dv is None:
+            return state, state.base + future.T + bias
+        change, now = changes_of(state.dv, dv)
+        future = advance_free_response(future, self.dv_coefficients, change[0])
+        state = eqx.tree_at(lambda s: (s.future, s.dv), state, (future, now))
+        if len(change) > 1:  # what is still to come stays out of the register
+            future += future_response(self.dv_coefficients, change.at[0].set(0.0))
         return state, state.base + future.T + bias
 
     def limits_now(self, state: ControllerState) -> Tuning:
@@ -268,7 +282,7 @@ class Core(eqx.Module):
             search: whether whole moves may be searched for here; otherwise none but the relaxation is solved.
             most: Newton steps after which it gives up.
         """
-        state, free_response = self.observe(state, sample.cv, sample.mv, sample.manual)
+        state, free_response = self.observe(state, sample.cv, sample.mv, sample.manual, sample.dv)
         tuning = without(self.limits_now(state), state.sensors.off)
         qp, tables = self.condensed_now(state.sensors.off)
         correction, standing = self.correction(state), state
@@ -357,6 +371,21 @@ class Core(eqx.Module):
         state, moves = self.carry_out(moment, moment.decision.x, moment.good)
         own: dict[str, Any] = dict(move=moves[0], mv=state.mv, moves=moves, solve_time=jnp.asarray(jnp.nan))
         return state, StepInfo(**own, recovering=moment.recovering, **moment.said(self.tables.count > 0))
+
+
+def changes_of(
+    before: Float[Array, " dv"], dv: Float[Array, "row dv"]
+) -> tuple[Float[Array, "row dv"], Float[Array, " dv"]]:
+    """Changes of the measured disturbances from sample to sample, and what they are now [DV unit].
+
+    Args:
+        before: last known ones.
+        dv: now and in the samples to come; what is not a number is as in the row before.
+    """
+    known = jnp.abs(dv) < IMPLAUSIBLE  # false for what is not a number
+    row = jax.lax.cummax(jnp.where(known, 1 + jnp.arange(dv.shape[0])[:, None], 0))
+    filled = jnp.take_along_axis(jnp.concatenate([before[None], dv]), row, axis=0)
+    return jnp.diff(filled, axis=0, prepend=before[None]), filled[0]
 
 
 def outside_limits(tuning: Tuning, mv: Float[Array, " mv"]) -> Bool[Array, ""]:

@@ -1,7 +1,7 @@
 """What a controller is told at a sample, checked once for all controllers: measurements, setpoints, positions, manual MVs.
 
-A measurement may be bad, that is judged later (`measurement`); everything else must make sense. Traced values
-(inside `jax.jit`, `jax.vmap`, `jax.lax.scan`) are checked for their shapes only.
+A measurement, of a CV or a disturbance, may be bad, that is judged later (`measurement`, `core`); everything else must make
+sense. Traced values (inside `jax.jit`, `jax.vmap`, `jax.lax.scan`) are checked for their shapes only.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ class Sample(NamedTuple):
     setpoint: Any  # ``"horizon cv"`` over the horizon, or ``"cv"`` held over it [CV unit]
     mv: Any  # ``"mv"``, where the actuators stand; not a number where that is not known [MV unit]
     manual: Any  # ``"mv"``, MVs that somebody else moves
+    # ``"row dv"``, measured disturbances now and in the samples to come; not a number where unchanged; None without any
+    dv: Any = None  # [DV unit]
 
 
 def checked(
@@ -32,10 +34,15 @@ def checked(
     setpoint: ArrayLike,
     mv: ArrayLike | None = None,
     manual: ArrayLike | None = None,
+    dv: ArrayLike | None = None,
     *,
+    dv_names: tuple[str, ...] = (),
     lanes: int | None = None,
 ) -> Sample:
     """A sample of one controller, or of `lanes` of them with a lane axis first.
+
+    Args:
+        dv_names: of the model's measured disturbances.
 
     Raises:
         InputError: naming the argument, for other shapes, texts, setpoints that are not finite, and where JAX's double
@@ -61,29 +68,51 @@ def checked(
         manual = np.asarray(manual)
     if manual.shape != lead + mvs or manual.dtype != np.bool_:
         raise InputError("manual", _shown(manual), f"true or false for each of {_names(structure.mv_names)}")
-    return Sample(cv, setpoint, mv, manual)
+    return Sample(cv, setpoint, mv, manual, _disturbances(dv, dv_names, lead, horizon))
+
+
+def _disturbances(given: Any, names: tuple[str, ...], lead: tuple, horizon: tuple) -> Any:
+    """Rows of the measured disturbances, one where nothing is told of those to come; None without any."""
+    if not names:
+        if given is not None and np.size(given):
+            raise InputError("dv", _shown(given), "nothing: the model has no measured disturbances")
+        return None
+    now = (len(names),)
+    dv = np.full(lead + now, np.nan) if given is None else given
+    dv = _array("dv", dv, names, "DV unit", lead + now, lead + horizon + now)
+    return dv[..., None, :] if dv.ndim == len(lead) + 1 else dv
 
 
 def checked_start(
-    structure: Structure, cv: ArrayLike, mv: ArrayLike, *, lanes: int | None = None
-) -> tuple[Any, Any]:
-    """Measured CVs and present MVs that a controller starts from; all must be known.
+    structure: Structure,
+    cv: ArrayLike,
+    mv: ArrayLike,
+    dv: ArrayLike | None = None,
+    *,
+    dv_names: tuple[str, ...] = (),
+    lanes: int | None = None,
+) -> tuple[Any, Any, Any]:
+    """Measured CVs, present MVs and measured disturbances that a controller starts from; all must be known.
+
+    Args:
+        dv: zeros if not given; None comes back without any.
 
     Raises:
         InputError: naming the argument, for other shapes and values that are not finite.
     """
     require_double_precision()
-    out = []
+    out, lead = [], () if lanes is None else (lanes,)
+    dv = np.zeros((*lead, len(dv_names))) if dv is None else dv
     for path, value, names, unit in (
         ("cv", cv, structure.cv_names, "CV unit"),
         ("mv", mv, structure.mv_names, "MV unit"),
+        ("dv", dv, dv_names, "DV unit"),
     ):
-        lead = () if lanes is None else (lanes,)
         array = _array(path, value, names, unit, (*lead, len(names)))
         if not isinstance(array, Tracer) and not np.isfinite(array).all():
             raise InputError(path, _shown(array), f"{len(names)} finite numbers [{unit}] for {_names(names)}")
         out.append(array)
-    return out[0], out[1]
+    return out[0], out[1], out[2] if dv_names else None
 
 
 def require_double_precision() -> None:

@@ -16,6 +16,7 @@ closed what is left feeds a limit cycle between two positions.
 from __future__ import annotations
 
 import collections
+import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -158,6 +159,10 @@ def make_schedule(models: Sequence[StepResponseModel]) -> ModelSchedule:
                 raise InputError(
                     f"models[{k}].{key}", getattr(model, key), f"{getattr(first, key)} as models[0]"
                 )
+        if model.dv_names:
+            raise InputError(
+                f"models[{k}].dv", list(model.dv_names), "none: a schedule has no measured disturbances"
+            )
         where = dict(model.working_point)
         missing = [name for name in model.mv_names if not np.isfinite(where.get(name, np.nan))]
         if missing:
@@ -219,7 +224,9 @@ class ScheduledCore(Core):
         matrices = matrices_of(self.layout, self.size, coefficients, summed=False)
         qp = self.condensed(self.tuning, matrices)
         tables = eqx.tree_at(lambda t: t.scale, self.tables, qp.unit)
-        now = Core(self.layout, self.tuning, coefficients, qp, tables, self.size, self.switching)
+        known: dict[str, Any] = {field.name: getattr(self, field.name) for field in dataclasses.fields(Core)}
+        known |= dict(coefficients=coefficients, qp=qp, tables=tables)
+        now = Core(**known)
         return now.consider(state, sample, gap, search, most)
 
     def moving(self, before: Float[Array, " mv"], move: Float[Array, " mv"]) -> Float[Array, "cv mv future"]:
@@ -242,7 +249,7 @@ class _Table:
             raise InputError("kept", kept, "a whole number of controllers, 1 or more")
         self.reference, self.schedule, self.spacing, self.kept = controllers, schedule, spacing, kept
         self.size, self.init, self.structure = controllers.size, controllers.init, controllers.structure
-        self.scenarios, self.count = controllers.scenarios, 1
+        self.scenarios, self.dv_names, self.count = controllers.scenarios, controllers.dv_names, 1
         self.grid = np.array([step or spacing for step in self.structure.steps])
         self.built = 0  # controllers made so far
         self._table: collections.OrderedDict[tuple[float, ...], Controllers] = collections.OrderedDict()
@@ -308,8 +315,8 @@ class ScheduledController(Controller):
             self.lanes: Any = _Table(self.lanes, schedule, spacing, kept)
             return
         core = self.lanes.cores.shared
-        given = (core.layout, core.tuning, core.coefficients, core.qp, core.tables, core.size, core.switching)
-        scheduled = ScheduledCore(*given, schedule)
+        known: dict[str, Any] = {field.name: getattr(core, field.name) for field in dataclasses.fields(core)}
+        scheduled = ScheduledCore(**known, schedule=schedule)
         self.lanes.cores = Lanes(jax.tree.map(lambda _: None, scheduled), scheduled)
 
     @property

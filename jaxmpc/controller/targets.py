@@ -80,6 +80,7 @@ def augment(
     wide_model = dataclasses.replace(
         model,
         coefficients=jnp.concatenate([model.coefficients, jnp.asarray(own)]),
+        dv_coefficients=np.pad(np.asarray(model.dv_coefficients), ((0, len(mvs)), (0, 0), (0, 0))),
         cv_names=wide_names,
         cv_units=_units(model.cv_units, structure.cv_count, model.mv_units, mvs),
     )
@@ -119,10 +120,15 @@ class TargetController:
         self.controller = Controller(*augment(structure, tuning, model, target_weight), **options)
         self.targeted = tuple(i for i, name in enumerate(structure.mv_names) if name in target_weight)
 
-    def init(self, cv: Float[ArrayLike, " cv"], mv: Float[ArrayLike, " mv"]) -> ControllerState:
+    def init(
+        self,
+        cv: Float[ArrayLike, " cv"],
+        mv: Float[ArrayLike, " mv"],
+        dv: Float[ArrayLike, " dv"] | None = None,
+    ) -> ControllerState:
         """State at a steady state; arguments and errors as in `Controller.init`."""
-        cv, mv = checked_start(self.structure, cv, mv)
-        return self.controller.init(self._with(cv, mv), mv)
+        cv, mv, dv = checked_start(self.structure, cv, mv, dv, dv_names=self.controller.model.dv_names)
+        return self.controller.init(self._with(cv, mv), mv, dv)
 
     def step(
         self,
@@ -132,6 +138,7 @@ class TargetController:
         mv_target: Float[ArrayLike, " mv"],
         mv: Float[ArrayLike, " mv"] | None = None,
         manual: Bool[ArrayLike, " mv"] | None = None,
+        dv: Float[ArrayLike, " dv"] | Float[ArrayLike, "horizon dv"] | None = None,
     ) -> tuple[ControllerState, StepInfo]:
         """One sample; the objective in the info is J + J_u (6.20).
 
@@ -139,14 +146,14 @@ class TargetController:
             cv: measurement now, without the further CVs [CV unit].
             setpoint: at j = 1..Hp, or held over the horizon [CV unit].
             mv_target: held over the horizon [MV unit]; entries of MVs without a target are not looked at.
-            mv, manual: as in `Controller.step`.
+            mv, manual, dv: as in `Controller.step`.
         """
         given = checked(self.structure, cv, setpoint, mv, manual)
         self._check_targets(mv_target)
         xp = _module(given.cv, given.mv, state.position)
         stands = xp.where(given.mv == given.mv, given.mv, state.position)
         wide = self._with(given.cv, stands), self._with(given.setpoint, mv_target)
-        return self.controller.step(state, *wide, given.mv, given.manual)
+        return self.controller.step(state, *wide, given.mv, given.manual, dv)
 
     def _check_targets(self, mv_target: Any) -> None:
         """Refuse targets of another shape, and those that are not finite where they are looked at."""

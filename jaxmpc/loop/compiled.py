@@ -52,6 +52,14 @@ class Inputs(NamedTuple):
     errors: np.ndarray  # noise of the sensors, ``"scenario sample cv"`` [CV unit]
     faults: np.ndarray  # of the sensors, as of `measurement.fault_errors`
     told: np.ndarray  # ``"scenario"``, whether the controller is told where the actuators stand
+    dv: np.ndarray  # ``"scenario sample dv"``, what it is told of the disturbances [DV unit]
+    preview: bool  # whether it is told the setpoints and disturbances of the whole horizon
+
+    def part(self, index: np.ndarray) -> Inputs:
+        """Of some scenarios."""
+        return self._replace(
+            **{name: getattr(self, name)[index] for name in self._fields if name != "preview"}
+        )
 
 
 def simulate_compiled(
@@ -80,7 +88,7 @@ def simulate_compiled(
     parts = parts_of(count, most, cut=len(devices) > 1)
     places = [devices[k % len(devices)] if len(devices) > 1 else None for k in range(len(parts))]
     runs = [
-        _Run(controllers.part(part), plants.take(part), Inputs(*(v[part] for v in inputs)), record, place)
+        _Run(controllers.part(part), plants.take(part), inputs.part(part), record, place)
         for part, place in zip(parts, places, strict=True)
     ]
     with compiling_for(f"loops of {controllers.size}"):
@@ -112,10 +120,13 @@ class _Run:
     ):
         self.controllers, self.plants, self.record, self.place = controllers, plants, record, place
         self.count, self.samples = controllers.count, inputs.setpoints.shape[1]
-        outside = [inputs.setpoints, inputs.errors, inputs.faults, inputs.disturbance]
+        outside = [inputs.setpoints, inputs.errors, inputs.faults, inputs.dv, inputs.disturbance]
         together = np.concatenate(outside, axis=2)
+        self.window = (
+            LONGEST + 1 + (controllers.size.future if inputs.preview else 0)
+        )  # samples that a call is told
         # beyond the end the last sample is repeated
-        self.inputs = np.concatenate([together, np.repeat(together[:, -1:], LONGEST + 1, axis=1)], axis=1)
+        self.inputs = np.concatenate([together, np.repeat(together[:, -1:], self.window, axis=1)], axis=1)
         leaves, self.form = flattened((controllers.cores, plants))
         self.leaves = leaves if place is None else jax.device_put(leaves, place)
         self.told = inputs.told.astype(float)
@@ -128,7 +139,9 @@ class _Run:
         cvs = outputs.cv.shape[1]
         cv = outputs.cv + self.inputs[:, 0, cvs : 2 * cvs]
         rows = np.zeros((self.count, c.size.future, cvs))
-        sample = Sample(cv, rows, mv, np.zeros(mv.shape, dtype=bool))
+        told = c.size.future if self.window > LONGEST + 1 else 1
+        dv = np.zeros((self.count, told, c.size.dvs)) if c.size.dvs else None
+        sample = Sample(cv, rows, mv, np.zeros(mv.shape, dtype=bool), dv)
         shapes = jax.eval_shape(considered, c.cores, state, sample, c.settings)
         moment = jax.tree.map(lambda v: np.zeros(v.shape, v.dtype), shapes)._replace(state=state)
         no: Any = np.zeros(self.count, dtype=bool)
@@ -156,7 +169,7 @@ class _Run:
             was carried out, how many samples were measured, and whether all scenarios of the last one are decided.
         """
         settings = np.concatenate([self.controllers.settings, self.told[:, None]], axis=1)
-        given = (packed, self.inputs[:, begin : begin + LONGEST + 1], settings)
+        given = (packed, self.inputs[:, begin : begin + self.window], settings)
         given = given if self.place is None else jax.device_put(given, self.place)
         packed, rows, (count, decided) = _stride(self.leaves, *given, most, self.form, self.of_now)
         seen, done = jax.tree.map(np.asarray, rows)
@@ -224,9 +237,10 @@ def _stride(leaves, packed, inputs, settings, most, form, of_now: Packing):
     """See `_Run.stride`."""
     cores, plants = rebuilt(form, leaves)
     now: Now = of_now.unpack(packed)
-    cvs, future = now.cv.shape[1], now.moment.free_response.shape[1]
+    cvs, future, dvs = now.cv.shape[1], now.moment.free_response.shape[1], cores.value.size.dvs
     setpoints, errors, faults = (inputs[..., k * cvs : (k + 1) * cvs] for k in range(3))
-    disturbance, told = inputs[..., 3 * cvs :], settings[:, 3:] > 0
+    known, disturbance = inputs[..., 3 * cvs : 3 * cvs + dvs], inputs[..., 3 * cvs + dvs :]
+    told, preview = settings[:, 3:] > 0, inputs.shape[1] > LONGEST + 1
     late = now.decided[0].astype(int)  # measured is sample `late`, then late + 1, ...
 
     def carry_out(now: Now, at) -> tuple[Now, dict[str, Array]]:
@@ -241,13 +255,22 @@ def _stride(leaves, packed, inputs, settings, most, form, of_now: Packing):
         )
         return now, dict(mv_demand=state.mv, mv=outputs.mv, move=moves[:, 0], plan=moves)
 
+    def ahead(values, begin, rows):
+        """What is told of so many samples; of the first one only without a preview."""
+        if preview:
+            return jax.lax.dynamic_slice_in_dim(values, begin, rows, axis=1)
+        return values[:, begin, None]
+
     def measure(now: Now, at) -> tuple[Now, dict[str, Array]]:
         before = now.moment.state
         sample = Sample(
             cv=received(now.cv, faults[:, at], before.sensors.value),
-            setpoint=jnp.broadcast_to(setpoints[:, at, None], (now.cv.shape[0], future, cvs)),
+            setpoint=jnp.broadcast_to(
+                ahead(setpoints, at + 1 if preview else at, future), (now.cv.shape[0], future, cvs)
+            ),
             mv=jnp.where(told, now.mv, jnp.nan),
             manual=jnp.zeros(now.mv.shape, dtype=bool),
+            dv=ahead(known, at, future) if dvs else None,
         )
         moment = considered(cores, before, sample, settings[:, :3])
         found, state, whole = moment.decision, moment.state, cores.value.tables.count > 0

@@ -39,13 +39,18 @@ def simulate_on_host(
     """
     setpoints, offsets, errors, faults = (v[0] for v in inputs[:4])
     told, total, named = bool(inputs.told[0]), len(setpoints), hasattr(plant, "disturbance_names")
+    future = takeovers[0].lanes.size.future if inputs.preview else 1
+    beyond = lambda v: np.concatenate([v, np.repeat(v[-1:], future, axis=0)])  # noqa: E731
+    references, dvs = beyond(setpoints), beyond(inputs.dv[0])
+    ahead = int(inputs.preview)  # the setpoint of the sample itself where no other is told
     outputs = plant.init()
     now, mv = np.asarray(outputs.cv), np.asarray(outputs.mv)
     states: dict[int, ControllerState] = {}
     for k, one in takeovers.items():
         states[k] = one.lanes.init(now[None], mv[None])
+        unknown = np.full_like(mv, np.nan)
         one.lanes.decide(
-            states[k], _sample(now, now, np.full_like(mv, np.nan))
+            states[k], _sample(now, now[None], unknown, dvs[:1])
         )  # compile before the clock starts
     controller, state = takeovers[0], states[0]
     records: list[dict[str, Any]] = []
@@ -58,7 +63,10 @@ def simulate_on_host(
             if carried is None or blind is None:
                 arrived = received(cv, faults[k], np.asarray(state.sensors.value)[0])
                 stands = np.asarray(outputs.mv)
-                sample = _sample(arrived, setpoints[k], stands if told else np.full_like(stands, np.nan))
+                stands = stands if told else np.full_like(stands, np.nan)
+                sample = _sample(
+                    arrived, references[k + ahead : k + ahead + future], stands, dvs[k : k + future]
+                )
                 state, info = controller.lanes.decide(state, sample)
                 record = {name: value[0] for name, value in recorded(cv[None], state, info).items()}
                 carried = CarriedOut(controller.structure, record) if k == blind else None
@@ -71,9 +79,10 @@ def simulate_on_host(
     return {name: np.stack([record[name] for record in records]) for name in records[0]}
 
 
-def _sample(cv: np.ndarray, setpoint: np.ndarray, mv: np.ndarray) -> Sample:
+def _sample(cv: np.ndarray, setpoint: np.ndarray, mv: np.ndarray, dv: np.ndarray) -> Sample:
     """Of one lane, with its axis."""
-    return Sample(cv[None], setpoint[None], mv[None], np.zeros((1, len(mv)), dtype=bool))
+    known = dv[None] if dv.size else None
+    return Sample(cv[None], setpoint[None], mv[None], np.zeros((1, len(mv)), dtype=bool), known)
 
 
 def recorded(cv: np.ndarray, state: ControllerState, info: StepInfo) -> dict[str, np.ndarray]:

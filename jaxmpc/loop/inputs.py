@@ -32,6 +32,8 @@ class Sweep:
     seeds: np.ndarray  # "lane 2": seed and stream
     faults: np.ndarray  # "sample cv" or "lane sample cv"
     position_feedback: np.ndarray  # "lane"
+    measured: list[int]  # which of the disturbances the controllers are told
+    preview: bool
     samples: int
     count: int
 
@@ -42,7 +44,18 @@ class Sweep:
 
     @classmethod
     def checked(
-        cls, controllers, plants, reference, samples, disturbance, noise, seed, faults, position_feedback
+        cls,
+        controllers,
+        plants,
+        reference,
+        *,
+        samples,
+        disturbance,
+        noise,
+        seed,
+        faults,
+        position_feedback,
+        preview,
     ) -> Sweep:
         """The sweep, or an `InputError` that names what does not fit."""
         plants = plants if isinstance(plants, Lanes) else for_all(plants)
@@ -61,6 +74,11 @@ class Sweep:
         known = {r: r.sample(structure.dt, samples) for r in dict.fromkeys(references)}
         setpoints = [known[r] for r in references]
         names, shape = disturbances_of(plants.shared), (samples or 0, structure.cv_count)
+        for name in controllers.dv_names:
+            if name not in names:
+                raise InputError("model.dv", name, f"one of the plant's disturbances, {list(names)}")
+        if not isinstance(preview, bool | np.bool_):
+            raise InputError("preview", preview, "true or false")
         offsets = (
             np.zeros((samples or 0, len(names)))
             if disturbance is None
@@ -115,6 +133,8 @@ class Sweep:
             seeds=np.stack([np.broadcast_to(seed, count), stream], axis=1).astype(np.int64),
             faults=failing,
             position_feedback=np.broadcast_to(told, count),
+            measured=[names.index(name) for name in controllers.dv_names],
+            preview=bool(preview),
             samples=len(setpoints[0]),
             count=count,
         )
@@ -127,12 +147,15 @@ class Sweep:
 
     def inputs_of(self, index: np.ndarray) -> Inputs:
         """What comes from outside, of some lanes."""
+        disturbance = self._of(self.offsets, 3, index)
         return Inputs(
             setpoints=self.setpoints_of(index),
-            disturbance=self._of(self.offsets, 3, index),
+            disturbance=disturbance,
             errors=errors_of(self.deviation[index], self.seeds[index], self.samples),
             faults=self._of(self.faults, 3, index),
             told=self.position_feedback[index],
+            dv=disturbance[..., self.measured],
+            preview=self.preview,
         )
 
     def setpoints_of(self, index: np.ndarray) -> np.ndarray:

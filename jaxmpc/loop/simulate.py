@@ -42,6 +42,7 @@ def simulate(
     seed: int = 0,
     faults: Float[ArrayLike, "sample cv"] | None = None,
     position_feedback: bool = False,
+    preview: bool = False,
     changes: Sequence[tuple[float, Controller]] = (),
     open_loop_from: float | None = None,
     keep_plans: bool = False,
@@ -54,10 +55,12 @@ def simulate(
         reference: setpoints, covering the run.
         samples: length of the run; the whole reference if not given.
         disturbance: in every sample, ``"sample disturbance"`` in the order of the plant's `disturbance_names`; a single one
-            may go without its axis; none if not given.
+            may go without its axis; none if not given. The controller is told those that its model has as DVs.
         noise: standard deviation of the measurement noise, ``"cv"`` [CV unit]; none if not given.
         faults: errors of failing sensors ``"sample cv"``, from `measurement.fault_errors`; none if not given.
         position_feedback: whether the controller is told where the actuators stand, and predicts from there.
+        preview: whether it is told the setpoints and the measured disturbances of the whole horizon; beyond the end of
+            the run they stay as they are.
         changes: times [s] and controllers of equal structure that take over then, with the state of the one before.
         open_loop_from: from the plan made at this time [s] on, no measurement is used and nothing is solved: the plan is
             carried out to its end, then the MVs are held. Status, bias and objective stay those of the plan.
@@ -70,7 +73,7 @@ def simulate(
     Raises:
         InputError: if sampling intervals differ, the reference has other CVs or ends before the run, the disturbance
             has not one finite value per sample and name, the noise not one standard deviation per CV, the faults not one
-            error per sample and CV, or a change does not fit.
+            error per sample and CV, the plant lacks a DV of the model, or a change does not fit.
     """
     structure = controller.structure
     if (noise is not None and np.ndim(noise) > 1) or np.ndim(seed):
@@ -79,12 +82,13 @@ def simulate(
         controller.lanes,
         plant,
         [reference],
-        samples,
-        disturbance,
-        noise,
-        seed,
-        faults,
-        bool(position_feedback),
+        samples=samples,
+        disturbance=disturbance,
+        noise=noise,
+        seed=seed,
+        faults=faults,
+        position_feedback=bool(position_feedback),
+        preview=preview,
     )
     setpoints, inputs = run.setpoints[0], run.inputs_of(np.arange(1))
     takeovers, blind = checked_changes(controller, changes, len(setpoints)), None
@@ -150,6 +154,7 @@ def simulate_batches(
     seed: Int[ArrayLike, "*lane"] = 0,
     faults: Float[ArrayLike, "*lane sample cv"] | None = None,
     position_feedback: ArrayLike = False,
+    preview: bool = False,
     record: Sequence[str] = RECORDABLE,
     lanes_at_once: int = LANES,
     devices: Sequence[Any] | None = None,
@@ -174,6 +179,7 @@ def simulate_batches(
             not given.
         position_feedback: whether the controllers are told where the actuators stand, and predict from there; one for
             all or ``"lane"``.
+        preview: as in `simulate`, for all lanes.
         record: names of the fields of `Trajectory` to keep; the others are never stored.
         lanes_at_once: lanes of one piece; fewer where the lanes then divide evenly. Each size compiles once.
         devices: to spread the lanes over; all of this process if not given.
@@ -186,7 +192,16 @@ def simulate_batches(
     if not isinstance(lanes, Batch):
         raise InputError("controllers", type(lanes).__name__, "Controllers, or a Controller for all")
     sweep = Sweep.checked(
-        lanes, plants, reference, samples, disturbance, noise, seed, faults, position_feedback
+        lanes,
+        plants,
+        reference,
+        samples=samples,
+        disturbance=disturbance,
+        noise=noise,
+        seed=seed,
+        faults=faults,
+        position_feedback=position_feedback,
+        preview=preview,
     )
     unknown = [field for field in record if field not in RECORDABLE]
     if unknown:

@@ -51,10 +51,11 @@ class Size(NamedTuple):
     past: int  # moves that the mean-move limit and the dwell remember
     own_blocks: bool = False  # whether the MVs may have blocks of their own
     values: int = 0  # allowed values of an MV, none where no MV has a list
+    dvs: int = 0  # measured disturbances
 
     @classmethod
-    def of(cls, structure: Structure, samples: int) -> Size:
-        """The size of a structure with a model of so many coefficients."""
+    def of(cls, structure: Structure, samples: int, dvs: int = 0) -> Size:
+        """The size of a structure with a model of so many coefficients and measured disturbances."""
         lists = [values for values in structure.integer_values if values is not None]
         return cls(
             cvs=structure.cv_count,
@@ -66,6 +67,7 @@ class Size(NamedTuple):
             past=rung(max(structure.mean_move_window, *structure.dwell, 1), WINDOW),
             own_blocks=structure.own_blocks,
             values=rung(max(map(len, lists)), VALUES) if lists else 0,
+            dvs=dvs,
         )
 
     @property

@@ -77,10 +77,8 @@ class ModelPlant(JaxPlant):
         start: Mapping[str, float] | None = None,
     ):
         self.dt, self.cv_names, self.mv_names = model.dt, model.cv_names, model.mv_names
-        self.dv_names = tuple(getattr(model, "dv_names", ()))
-        tables = [np.asarray(model.coefficients)]
-        if self.dv_names:
-            tables.append(np.asarray(getattr(model, "dv_coefficients", None)))
+        self.dv_names = model.dv_names
+        tables = np.asarray(model.coefficients), np.asarray(model.dv_coefficients)
         self.nominal = self.coefficients = np.concatenate(tables, axis=1)
         self.common = np.array([knob.default for knob in KNOBS])
         self.pairs = np.tile(self.common[:, None, None], self.nominal.shape[:2])

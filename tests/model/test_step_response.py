@@ -8,6 +8,7 @@ from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import (
     StepResponseModel,
     advance_free_response,
+    future_response,
     make_model,
     shift_free_response,
 )
@@ -63,6 +64,30 @@ def test_a_model_survives_its_file(tmp_path):
     )
 
 
+def test_measured_disturbances_survive_the_file_and_are_shown(tmp_path):
+    dvs = dict(dv_names=["rate"], dv_units=["m3/h"], dv_coefficients=[[[3.0, 4.0]]])
+    model = make_model([[[1.0, 2.0]]], 5.0, ["y"], ["u"], **dvs)
+    again = StepResponseModel.load(model.save(tmp_path / "m.json"))
+    assert (again.dv_names, again.dv_units) == (("rate",), ("m3/h",))
+    np.testing.assert_array_equal(again.dv_coefficients, [[[3.0, 4.0]]])
+    np.testing.assert_array_equal(again.extended_dvs(3), [[[3.0, 4.0, 4.0]]])
+    assert "rate [m3/h], measured disturbance" in again._repr_html_()
+    plain = make_model([[[1.0, 2.0]]], 5.0, ["y"], ["u"])
+    assert plain.dv_coefficients.shape == (1, 0, 2)
+    assert not [key for key in plain.to_dict() if key.startswith("dv")]
+
+
+@pytest.mark.parametrize("horizon", [1, 5])
+def test_changes_to_come_act_from_the_sample_after_them(horizon):
+    rng = np.random.default_rng(1)
+    steps, change = rng.normal(size=(2, 3, horizon)), rng.normal(size=(horizon, 3))
+    expected = np.zeros((2, horizon))
+    for j in range(horizon):
+        for later in range(j + 1, horizon + 1):
+            expected[:, later - 1] += steps[..., later - j - 1] @ change[j]
+    np.testing.assert_allclose(future_response(jnp.asarray(steps), jnp.asarray(change)), expected, atol=1e-12)
+
+
 def test_coefficients_keep_their_last_value_beyond_n():
     model = make_model([[[1.0, 2.0, 4.0]]], 5.0, ["y"], ["u"])
     assert np.array_equal(model.extended(5)[0, 0], [1, 2, 4, 4, 4])
@@ -79,6 +104,13 @@ def test_coefficients_keep_their_last_value_beyond_n():
         ({"coefficients": [[[1.0, float("nan")]]]}, "model.coefficients[0, 0, 1]"),
         ({"coefficients": [[[]]]}, "model.coefficients"),
         ({"cv_units": ["a", "b"]}, "model.cv_units"),
+        ({"dv": ["d", "d"]}, "model.dv"),
+        ({"dv": ["u"], "dv_coefficients": [[[1.0, 2.0]]]}, "model.dv"),
+        ({"dv": ["d"]}, "model.dv_coefficients"),
+        ({"dv_coefficients": [[[1.0, 2.0]]]}, "model.dv_coefficients"),
+        ({"dv": ["d"], "dv_coefficients": [[[1.0, 2.0, 3.0]]]}, "model.dv_coefficients"),
+        ({"dv": ["d"], "dv_coefficients": [[[1.0, None]]]}, "model.dv_coefficients[0, 0, 1]"),
+        ({"dv": ["d"], "dv_coefficients": [[[1.0, 2.0]]], "dv_units": ["a", "b"]}, "model.dv_units"),
     ],
 )
 def test_a_bad_model_file_names_the_field(tmp_path, change, field):
