@@ -19,7 +19,7 @@ from jaxmpc.controller.measurement import MISSING, received
 from jaxmpc.controller.sample import Sample
 from jaxmpc.errors import PlantError
 from jaxmpc.loop.compiled import Inputs
-from jaxmpc.loop.host import recorded
+from jaxmpc.loop.host import recorded, undisturbed
 from jaxmpc.process.plant import StatefulPlant
 from jaxmpc.programs.compilation import compiling_for
 from jaxmpc.programs.threads import parts_of, side_by_side
@@ -65,7 +65,8 @@ def simulate_host_lanes(
         failures.update({first + lane: error for lane, error in failed.items()})
         return {name: values[: len(own)] for name, values in fields.items()}
 
-    found = side_by_side(advance, range(len(parts)))
+    with undisturbed():
+        found = side_by_side(advance, range(len(parts)))
     fields = {name: np.concatenate([part.pop(name) for part in found]) for name in list(found[0])}
     return fields, dict(sorted(failures.items()))
 

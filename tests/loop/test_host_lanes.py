@@ -66,7 +66,7 @@ def run(monkeypatch, structure, model, tunings, path, biases, preview=False):
     fields, failures = simulate_host_lanes(
         controllers, plants, sweep.inputs_of(np.arange(LANES)), done.append
     )
-    assert all(plant._process.closed or k in failures for k, plant in enumerate(plants))
+    assert all(plant._process is None for plant in plants)
     assert sum(done) == LANES * SAMPLES
     return fields, failures, plants, loads
 
@@ -81,7 +81,13 @@ def test_every_lane_is_the_loop_of_its_controller_and_plant(
     assert failures == {}
     for k, plant in enumerate(plants):
         with plant:
-            own = {"disturbance": loads[k, :, 0], "noise": NOISE, "seed": k, "position_feedback": TOLD[k], "preview": preview}
+            own = {
+                "disturbance": loads[k, :, 0],
+                "noise": NOISE,
+                "seed": k,
+                "position_feedback": TOLD[k],
+                "preview": preview,
+            }
             alone = simulate(Controller(structure, tunings[k], model), plant, REFERENCE, **own)
         for name in ("cv", "mv", "mv_demand", "bias", "status"):
             np.testing.assert_allclose(fields[name][k], getattr(alone, name), atol=1e-9, err_msg=name)
