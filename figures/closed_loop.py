@@ -17,8 +17,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from figures import panels, style
+from jaxmpc.files import strict_json
 from jaxmpc.loop.trajectory import Trajectory
-from studies.thesis.well import CHOKE
+from jaxmpc.process.process import Process
 
 RUN = "run"  # name of the one controller in results of one run
 PINNED: dict[str, Any] = {"color": "#9A9A9A", "linewidth": 1.8, "label": "pinned", "zorder": 1.5}
@@ -34,22 +35,24 @@ def draw_run(
     kind: str = "mixed-integer",
     actuator: str = "step",
     name: str = "run",
+    process: Process | None = None,
 ) -> list[Path]:
-    """Draw one run: CVs with setpoint and deadzone, demanded and actual choke, lift.
+    """Draw one run: CVs with setpoint and deadzone, then MVs with what was demanded of stepped actuators.
 
     Args:
-        trajectory: of the well.
+        trajectory: of the run.
         deadzone: half width per CV [CV unit]; 0 draws no band.
         folder: for the files.
         title: above the panels.
         kind: of the controller, for the colour.
-        actuator: of the choke, for the colour.
+        actuator: of the MVs, ``step`` or ``continuous``, for the colour.
         name: of the files.
+        process: that was controlled, for labels and stepped MVs.
 
     Returns:
         The PNG and the PDF.
     """
-    return style.save(run(of_trajectory(trajectory, deadzone, kind, actuator), title), folder, name)
+    return style.save(run(of_trajectory(trajectory, deadzone, kind, actuator, process), title), folder, name)
 
 
 def run(data: xr.Dataset, title: str) -> Figure:
@@ -68,12 +71,12 @@ def tracking(
     legend: bool = True,
     bins: int = 12,
 ) -> None:
-    """CVs with setpoint and deadzone, then MVs, the choke with what was demanded, a panel each; a pinned run in grey behind.
+    """CVs with setpoint and deadzone, MVs, stepped ones with what was demanded, a panel each; a pinned run in grey behind.
 
     Of `pinned`, results of one controller `RUN`, only times of `data` are drawn. A time axis has at most `bins` numbers.
     """
     start, end = panels.span(data)
-    cvs = panels.cv_names(data)
+    cvs, stepped = panels.cv_names(data), panels.stepped(data)
     for ax, channel in zip(axes, [*cvs, *panels.mv_names(data)], strict=True):
         seconds = panels.time_axis(ax, start, end, bins)
         spec = ax.get_subplotspec()
@@ -86,14 +89,16 @@ def tracking(
         if channel in cvs:
             panels.controlled(ax, data, controller, channel, seconds, legend=legend)
         else:
-            demand = channel == CHOKE and "demand" in data
+            demand = channel in stepped
             panels.manipulated(ax, data, controller, channel, seconds, demand=demand)
             if legend and demand:
                 panels.legend_above(ax)
         panels.changes(ax, data, seconds)
 
 
-def of_trajectory(trajectory: Trajectory, deadzone: Any, kind: str, actuator: str) -> xr.Dataset:
+def of_trajectory(
+    trajectory: Trajectory, deadzone: Any, kind: str, actuator: str, process: Process | None = None
+) -> xr.Dataset:
     """A trajectory as `results`; its other arguments."""
     run = xr.Dataset(
         {
@@ -112,10 +117,12 @@ def of_trajectory(trajectory: Trajectory, deadzone: Any, kind: str, actuator: st
             "mv_unit": ("mv", list(trajectory.mv_units)),
         },
     )
-    return results(run, trajectory.dt, deadzone, kind, actuator)
+    return results(run, trajectory.dt, deadzone, kind, actuator, process)
 
 
-def results(run: xr.Dataset, dt: float, deadzone: Any, kind: str, actuator: str) -> xr.Dataset:
+def results(
+    run: xr.Dataset, dt: float, deadzone: Any, kind: str, actuator: str, process: Process | None = None
+) -> xr.Dataset:
     """One run as panels read the results of a comparison: its controller is called `RUN`.
 
     Args:
@@ -123,7 +130,8 @@ def results(run: xr.Dataset, dt: float, deadzone: Any, kind: str, actuator: str)
         dt: sampling interval [s].
         deadzone: half width for all CVs or per CV [CV unit]; 0 without Soft MPC.
         kind: of the controller.
-        actuator: of the choke.
+        actuator: of the MVs.
+        process: that was controlled, if it is known.
     """
     changed = np.any(np.diff(run.setpoint.values, axis=0) != 0, axis=1)
     half = np.broadcast_to(np.asarray(deadzone, dtype=float), (1, run.sizes["cv"]))
@@ -136,4 +144,5 @@ def results(run: xr.Dataset, dt: float, deadzone: Any, kind: str, actuator: str)
     }
     for name in ("tuning_soft_quadratic", "tuning_soft_linear"):
         variables[name] = (("controller", "cv"), 1.0 * (half > 0))
-    return run.expand_dims(controller=[RUN]).assign(variables).assign_attrs(dt=dt)
+    known = {} if process is None else {"process": strict_json(process.body)}
+    return run.expand_dims(controller=[RUN]).assign(variables).assign_attrs(dt=dt, **known)

@@ -17,17 +17,27 @@ from matplotlib.figure import Figure
 
 from figures import closed_loop, panels, style
 from figures.closed_loop import RUN
-from figures.sweep.data import controller_of, deviation, figure_of, load, setting, sweep_axes
+from figures.planned import BEFORE, draw_plan
+from figures.sweep.data import (
+    SETTLED,
+    controller_of,
+    deviation,
+    figure_of,
+    load,
+    setting,
+    shown_mv,
+    sweep_axes,
+    travel_title,
+)
 from figures.sweep.wear import front
-from figures.thesis.plans import BEFORE, draw_plan
 from jaxmpc.errors import InputError
 from studies.kpi.evaluate import completed, key_figures
 from studies.plans import plan_at
 from studies.store.files import RESULTS
+from studies.store.process import process_in
 from studies.store.reading import open_results
 
-X, Y = "travel", "deviation"  # columns of `points`, [%] and [1]
-TITLES = {X: "choke travel [%]", Y: "mean deviation / thesis deadzone [1]"}
+X, Y = "travel", "deviation"  # columns of `points`, [MV unit] and [1]
 
 
 @style.house_style
@@ -47,10 +57,14 @@ def tracking(
 
 @style.house_style
 def planned(data: xr.Dataset, time: float, controller: str = RUN) -> Figure:
-    """The plan made at a time [s], as in figure 25: rates, inputs and moves; what came of it pale."""
+    """The plan made at a time [s]: CVs, MVs and their moves; what came of it pale."""
     plan = plan_at(data, controller, time)
-    drawn, axes = _panels(3, 2, 9.6, 5.2)
-    shown = max(plan.time - BEFORE, 0.0), float(plan.cv_time[-1])
+    used = data.sizes["cv"], data.sizes["mv"], data.sizes["mv"]
+    drawn, axes = _panels(3, max(used), 9.6, 5.2)
+    for row, count in zip(axes, used, strict=True):
+        for ax in row[count:]:
+            ax.set_visible(False)
+    shown = max(plan.time - BEFORE * plan.dt, 0.0), float(plan.cv_time[-1])
     draw_plan(axes, data, controller, plan, shown, known=plan.time, pale=True)
     panels.shared_legend(drawn, axes.flat, "upper center", borderaxespad=0.2)
     return drawn
@@ -63,9 +77,9 @@ def points(store: str | Path) -> pd.DataFrame:
         store: of a sweep (ending in ``.zarr``) or of a comparison (its folder or ``results.zarr``).
 
     Returns:
-        A table with ``number`` (of the scenario; position of the controller in a comparison), ``run`` in words, `X` [%],
-        `Y` [1], ``group`` for the colours (attribute ``group`` says what it is), ``best`` for runs that no other beats in
-        both, and a text column for each thing that varies.
+        A table with ``number`` (of the scenario; position of the controller in a comparison), ``run`` in words, `X` of
+        `figures.sweep.data.shown_mv`, `Y` [1], ``group`` for the colours, ``best`` for runs that no other beats in both, and
+        a text column for each thing that varies. Attribute ``group`` says what the groups are, ``titles`` what `X` and `Y`.
 
     Raises:
         InputError: if there is no store, or nothing of it is finished.
@@ -85,13 +99,14 @@ def points(store: str | Path) -> pd.DataFrame:
         names = [", ".join(map(" ".join, zip(texts, row, strict=True))) for row in rows]
         groups = next(iter(texts.values()), ["all"] * len(names))
     travel, away = (
-        values.values.astype(float) for values in (figure_of(figures, "choke_travel"), deviation(figures))
+        values.values.astype(float) for values in (figure_of(figures, "travel"), deviation(figures))
     )
     best = np.where(front(travel, away), "on the front", "beaten")
     out = pd.DataFrame(
         {"number": numbers, "run": names, X: travel, Y: away, "group": groups, **texts, "best": best}
     )
     out.attrs["group"] = title
+    out.attrs["titles"] = {X: travel_title(shown_mv(process_in(data))), Y: f"mean deviation / {SETTLED} [1]"}
     return out
 
 
@@ -128,7 +143,7 @@ def stored(store: str | Path, number: int) -> xr.Dataset:
     one = one.isel(time=slice(0, int(last[-1]) + 1 if last.size else 0))
     dt = float(np.diff(one.time.values[:2])[0]) if one.sizes["time"] > 1 else 1.0
     zones = [_deadzone(whole, place, str(cv)) for cv in one.cv.values]
-    return closed_loop.results(one, dt, zones, str(kinds[place]), str(actuators[place]))
+    return closed_loop.results(one, dt, zones, str(kinds[place]), str(actuators[place]), process_in(whole))
 
 
 def scatter(table: pd.DataFrame) -> Any:
@@ -138,17 +153,17 @@ def scatter(table: pd.DataFrame) -> Any:
     varying = [str(name) for name in table.columns if name not in ("best", "group", "number", X, Y)]
     many = len(set(table["group"])) > len(_COLOURS)
     legend = alt.Legend(title=table.attrs.get("group"), titleLimit=400, orient="top")
-    scale = alt.Scale(range=_COLOURS)
+    scale, titles = alt.Scale(range=_COLOURS), table.attrs.get("titles", {X: X, Y: Y})
     colour = alt.value(style.BLUE) if many else alt.Color("group:N", scale=scale, sort=None, legend=legend)
     return (
         alt.Chart(table)
         .mark_point(filled=True, size=90, strokeWidth=1.6, opacity=0.9)
         .encode(
-            x=alt.X(f"{X}:Q", title=TITLES[X], scale=alt.Scale(zero=False)),
-            y=alt.Y(f"{Y}:Q", title=TITLES[Y], scale=alt.Scale(zero=False)),
+            x=alt.X(f"{X}:Q", title=titles[X], scale=alt.Scale(zero=False)),
+            y=alt.Y(f"{Y}:Q", title=titles[Y], scale=alt.Scale(zero=False)),
             color=colour,
             stroke=alt.condition("datum.best == 'on the front'", alt.value("black"), alt.value("white")),
-            tooltip=[*varying, *(alt.Tooltip(f"{k}:Q", title=TITLES[k], format=",.4g") for k in (X, Y))],
+            tooltip=[*varying, *(alt.Tooltip(f"{k}:Q", title=titles[k], format=",.4g") for k in (X, Y))],
         )
         .properties(width="container", height=300, usermeta={"embedOptions": {"renderer": "svg"}})
     )
@@ -186,7 +201,8 @@ def _panels(rows: int, columns: int, width: float, height: float) -> tuple[Figur
 def _deadzone(data: xr.Dataset, place: int, cv: str) -> float:
     """Half width of the deadzone of a scenario; 0 without Soft MPC."""
     one = data.isel(scenario=[place])  # an axis of one value is a setting
-    hard = setting(one, "soft") in (False, "false") or str(setting(one, "preset")).startswith("no-soft")
+    soft = sum(float(setting(one, f"tuning.{key}.{cv}")) for key in ("soft_quadratic", "soft_linear"))
+    hard = setting(one, "soft") in (False, "false") or soft == 0
     return 0.0 if hard else float(setting(one, f"tuning.deadzone.{cv}"))
 
 

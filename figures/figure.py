@@ -1,6 +1,7 @@
 """What a figure is: its number, the study that it reads, the function that draws it, and what to say about it.
 
-Drawing, caption and entry of a figure stand in one file of `figures.thesis`; `figures.registry` collects the entries.
+Drawing, caption and entry of a figure stand in one file of `figures.thesis` or `figures.comparison`; `figures.registry`
+collects the entries.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ class FigureEntry:
     Attributes:
         id: ``10`` for thesis figure 10, or a name.
         title: what it shows.
-        study: name in `studies.thesis.catalogue.STUDIES` of the study whose results it reads; None if it reads none.
+        study: the kind of comparison whose results it reads, one of `studies.thesis.catalogue.STUDIES`, or ``comparison``
+            for any; None if it reads none.
         function: makes it from the results and `arguments`; its docstring begins with what is drawn.
         caption: one to three sentences on what to see, or a function of the results and `arguments` that gives them.
         slug: what its files are called behind ``figure_10_``; those of a figure with a name have that name.

@@ -18,8 +18,8 @@ from figures.produce import check_asked, study_folder
 from figures.registry import FIGURES
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
-from studies.definition.comparison import PlantKind
 from studies.store.reading import open_results
+from studies.thesis.catalogue import PLANTS
 
 PAGE = "index.html"
 TEMPLATE = Path(__file__).with_name("gallery.html")
@@ -31,7 +31,7 @@ def write_gallery(
     results: str | Path = "results",
     out: str | Path = "figures-out",
     quick: bool = False,
-    plant: PlantKind = "fmu",
+    plant: str = PLANTS[0],
 ) -> Path:
     """Write the page beside the figures that `figures.produce.produce` has drawn with the same arguments.
 
@@ -49,7 +49,7 @@ def write_gallery(
         InputError: for an unknown id, a figure or results that are missing, or a page of more than 10 MB; before
             anything is written.
     """
-    ids = check_asked(ids, plant)
+    ids = check_asked(ids, quick, plant)
     entries = [FIGURES[id] for id in ids]
     pictures = [Path(out) / f"{entry.name}.png" for entry in entries]
     for entry, picture in zip(entries, pictures, strict=True):
@@ -60,7 +60,7 @@ def write_gallery(
     for entry in entries:
         if entry.study is not None and entry.study not in read:
             read[entry.study] = open_results(study_folder(entry.study, results, quick, plant)).load()
-    options = (" --quick" if quick else "") + (f" --plant {plant}" if plant != "fmu" else "")
+    options = (" --quick" if quick else "") + (f" --plant {plant}" if plant != PLANTS[0] else "")
     blanks = {
         "contents": "\n".join(
             f'<li><a href="#figure-{html.escape(entry.id)}">{html.escape(heading(entry))}</a></li>'

@@ -16,8 +16,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from figures import style
+from studies.store.process import process_in
 
-HOUR = 3600.0
+HOUR, MINUTE = 3600.0, 60.0
 SAME = 1e-6  # MV units between a demand and a position that are one line
 THIN: dict[str, Any] = {"color": style.GREY, "linestyle": (0, (3, 3)), "linewidth": 0.8}
 
@@ -26,22 +27,57 @@ Curves = Mapping[str, Mapping[str, Any]]  # label, perhaps colour, of the curve 
 
 def run_colour(data: xr.Dataset, controller: str) -> str:
     """The controller's colour."""
-    run = data.sel(controller=controller)
+    return run_colours(data)[controller]
+
+
+def run_colours(data: xr.Dataset) -> dict[str, str]:
+    """A colour of its own for each controller: that of its kind and actuators where no other has it before.
+
+    Controllers with the first preset of the process come first: those with another one are compared with them.
+    """
     names = [str(name) for name in data.controller.values]
-    tuning = str(run.tuning_preset.item()) if "tuning_preset" in run else ""
-    if tuning in style.TUNING_COLOURS:
-        return style.TUNING_COLOURS[tuning]
-    return style.colour(str(run.kind.item()), str(run.actuator.item()), names.index(controller))
+    kinds = zip(data.kind.values.tolist(), data.actuator.values.tolist(), strict=True)
+    wanted = {
+        name: style.CONTROLLER_COLOURS.get((kind, actuator))
+        for name, (kind, actuator) in zip(names, kinds, strict=True)
+    }
+    if "tuning_preset" in data:
+        first = process_in(data).default_preset
+        other = {
+            name
+            for name, preset in zip(names, data.tuning_preset.values.tolist(), strict=True)
+            if preset != first
+        }
+        wanted |= dict.fromkeys(other)
+    out: dict[str, str] = {}
+    for name, colour in wanted.items():
+        if colour is not None and colour not in out.values():
+            out[name] = colour
+    for i, name in enumerate(name for name in names if name not in out):
+        out[name] = style.SPARE_COLOURS[i % len(style.SPARE_COLOURS)]
+    return out
 
 
 def cv_names(data: xr.Dataset) -> list[str]:
-    """CVs from the top panel down: oil above gas, as in the thesis."""
-    return [str(name) for name in data.cv.values][::-1]
+    """CVs from the top panel down."""
+    return [str(name) for name in data.cv.values]
 
 
 def mv_names(data: xr.Dataset) -> list[str]:
     """MVs from the top panel down."""
     return [str(name) for name in data.mv.values]
+
+
+def stepped(data: xr.Dataset) -> list[str]:
+    """MVs whose actuators do not take every value."""
+    process = process_in(data)
+    known = {process.mv_names[i] for i in process.stepped}
+    return [name for name in mv_names(data) if name in known]
+
+
+def worn(data: xr.Dataset) -> list[str]:
+    """MVs whose moves count: those with stepped actuators, all where there are none."""
+    return stepped(data) or mv_names(data)
 
 
 def is_cv(data: xr.Dataset, channel: str) -> bool:
@@ -55,9 +91,14 @@ def unit_of(data: xr.Dataset, channel: str) -> str:
     return style.unit(str(data[f"{axis}_unit"].sel({axis: channel}).item()))
 
 
+def words_of(data: xr.Dataset, channel: str) -> str:
+    """A CV or MV in words, as its process calls it."""
+    return process_in(data).labels.get(channel) or style.name_of(channel)
+
+
 def label_of(data: xr.Dataset, channel: str, what: str = "") -> str:
     """Label of an axis with a CV or MV, `what` of it, and the unit."""
-    return style.label(channel, unit_of(data, channel), what)
+    return style.label(words_of(data, channel) + what, unit_of(data, channel))
 
 
 def span(data: xr.Dataset) -> tuple[float, float]:
@@ -65,9 +106,16 @@ def span(data: xr.Dataset) -> tuple[float, float]:
     return float(data.time.values[0]), float(data.time.values[-1]) + float(data.attrs["dt"])
 
 
+def between(data: xr.Dataset, start: float, end: float = np.inf, closed: bool = True) -> xr.Dataset:
+    """Samples from one time to another [s], that of the end included if `closed`."""
+    before = data.time.values <= end if closed else data.time.values < end
+    return data.isel(time=np.flatnonzero((data.time.values >= start) & before))
+
+
 def time_unit(start: float, end: float) -> tuple[float, str]:
-    """Unit of a time axis from `start` to `end` [s], hours or below four of them minutes: its seconds and its name."""
-    return (60.0, "min") if end - start < 4 * HOUR else (HOUR, "h")
+    """Seconds and name of the unit of a time axis from `start` to `end` [s]: the largest of which it has four."""
+    units = ((HOUR, "h"), (MINUTE, "min"))
+    return next(((size, name) for size, name in units if end - start >= 4 * size), (1.0, "s"))
 
 
 def time_axis(
@@ -152,6 +200,7 @@ def manipulated(
 ) -> None:
     """An MV as the actuator holds it over each sample, with the controller's demand if asked for and not the same."""
     run = data.sel(controller=controller, mv=mv)
+    demand = demand and "demand" in run
     look = {"color": run_colour(data, controller), "linewidth": _width(data), "label": "actual", **look}
     if demand and np.abs(run.demand.values - run.position.values).max() > SAME:
         thin = 0.6 * look["linewidth"]
@@ -210,16 +259,20 @@ def legend_above(axes: Axes, columns: int = 3, **options: Any) -> None:
 
 
 def shared_legend(
-    drawn: Figure, axes: Iterable[Axes], loc: Any = "outside upper center", **options: Any
+    drawn: Figure,
+    axes: Iterable[Axes],
+    loc: Any = "outside upper center",
+    columns: int | None = None,
+    **options: Any,
 ) -> None:
-    """One legend for all panels on top; the deadzone, which differs from CV to CV, without its width."""
+    """One legend for all panels, in one row or some columns; the deadzone, which differs from CV to CV, without its width."""
     found: dict[str, Any] = {}
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             found.setdefault("deadzone" if label.startswith("deadzone") else label, handle)
     if "demanded and actual" in found:  # of the MVs without a demand of their own
         found.pop("actual", None)
-    drawn.legend(list(found.values()), list(found), loc=loc, ncols=len(found), **options)
+    drawn.legend(list(found.values()), list(found), loc=loc, ncols=columns or len(found), **options)
 
 
 def _width(data: xr.Dataset) -> float:

@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from figures.registry import FIGURES, check_ids, draw
-from jaxmpc.errors import InputError
-from studies.definition.comparison import PLANTS, PlantKind
 from studies.run.comparison import is_current as stored_as
 from studies.store.writing import check_writable
 from studies.thesis import catalogue
@@ -18,7 +16,7 @@ def produce(
     results: str | Path = "results",
     out: str | Path = "figures-out",
     quick: bool = False,
-    plant: PlantKind = "fmu",
+    plant: str = catalogue.PLANTS[0],
     say: Callable[[str], None] = print,
 ) -> list[Path]:
     """Draw figures, and first run what is missing of the studies that they read.
@@ -28,7 +26,7 @@ def produce(
         results: folder of all results; each study has its own folder in it.
         out: folder for the figures.
         quick: read and run the shortened studies.
-        plant: ``fmu``, or ``jax`` for its JAX twin, which needs no C compiler.
+        plant: one of `studies.thesis.catalogue.PLANTS`.
         say: receives one line per event.
 
     Returns:
@@ -36,9 +34,9 @@ def produce(
 
     Raises:
         InputError: for an unknown id or plant or a folder that cannot be written, before anything runs.
-        MissingToolError: if the FMU is needed and cannot be built.
+        MissingToolError: if an FMU is needed and cannot be built.
     """
-    ids = check_asked(ids, plant)
+    ids = check_asked(ids, quick, plant)
     check_writable(out)
     studies = list(dict.fromkeys(FIGURES[id].study for id in ids))
     folders: dict[str | None, Path | None] = {None: None}
@@ -47,24 +45,24 @@ def produce(
         if is_current(study, results, quick, plant):
             say(f"{folders[study]}: complete.")
         else:
-            folders[study] = catalogue.run_named(study, results, quick, plant, say=say)
+            folders[study] = catalogue.run_thesis(study, results, quick, plant, say=say)
     drawn = [draw([id for id in ids if FIGURES[id].study == study], folders[study], out) for study in studies]
     return [path for paths in drawn for path in paths]
 
 
-def check_asked(ids: Iterable[str], plant: PlantKind) -> list[str]:
+def check_asked(ids: Iterable[str], quick: bool, plant: str) -> list[str]:
     """The ids that are asked for, each once, or an `InputError` for an unknown id or plant."""
     ids = check_ids(ids)
-    if plant not in PLANTS:
-        raise InputError("plant", plant, f"one of {', '.join(PLANTS)}")
+    catalogue.study_name("", quick, plant)
     return ids
 
 
-def study_folder(study: str, results: str | Path, quick: bool, plant: PlantKind) -> Path:
-    """Where the results of a study of the catalogue are."""
-    return Path(results) / catalogue.STUDIES[study](quick, plant).name
+def study_folder(study: str, results: str | Path, quick: bool, plant: str) -> Path:
+    """Where the results of a study of the thesis are."""
+    return Path(results) / catalogue.study_name(study, quick, plant)
 
 
-def is_current(study: str, results: str | Path, quick: bool, plant: PlantKind) -> bool:
-    """Whether every run of a study of the catalogue is stored, made from today's definition by today's code."""
-    return stored_as(catalogue.STUDIES[study](quick, plant), study_folder(study, results, quick, plant))
+def is_current(study: str, results: str | Path, quick: bool, plant: str) -> bool:
+    """Whether every run of a study of the thesis is stored, made from today's definition by today's code."""
+    definition = catalogue.comparison_of(study, quick, plant).definition
+    return stored_as(definition, study_folder(study, results, quick, plant))

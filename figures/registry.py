@@ -1,4 +1,4 @@
-"""Every figure by its id, and drawing them from stored results; the entries stand in the modules that draw them.
+"""Every figure of the thesis by its id, those of any comparison, and drawing them; the modules that draw have the entries.
 
 The command line (`jaxmpc figures`, `jaxmpc study run` of a comparison), `figures.produce` and `figures.gallery` call it.
 """
@@ -11,6 +11,8 @@ from pathlib import Path
 import xarray as xr
 
 from figures import style
+from figures.comparison import overview, tracking, wear
+from figures.comparison import summary as comparison_summary
 from figures.figure import FigureEntry
 from figures.thesis import (
     coefficients,
@@ -84,13 +86,41 @@ def draw(ids: Iterable[str], results: str | Path | xr.Dataset | None, out: str |
             raise InputError("results", None, f"results of the study {studies[0]}")
         data = (results if isinstance(results, xr.Dataset) else open_results(results)).load()
         _check_finished(entries, data)
+    return _drawn(entries, data, out)
+
+
+def draw_study(folder: str | Path, kind: str) -> list[Path]:
+    """Draw every figure of a comparison into the ``figures`` folder of its folder.
+
+    Args:
+        folder: of its results.
+        kind: `studies.definition.catalogue.Comparison.kind`; those of the thesis have their own figures, any other the ones
+            of `comparison_figures`.
+
+    Returns:
+        The files written.
+
+    Raises:
+        InputError: if no run of it is finished, or not one that a figure needs.
+    """
+    entries = [entry for entry in FIGURES.values() if entry.study == kind]
+    data = open_results(folder).load()
+    _check_finished(entries, data)
+    return _drawn(entries or comparison_figures(data), data, Path(folder) / "figures")
+
+
+def comparison_figures(data: xr.Dataset) -> list[FigureEntry]:
+    """The figures of a comparison of any process: of all its runs, then of each finished one."""
+    return [
+        *comparison_summary.ENTRIES,
+        *overview.ENTRIES,
+        *wear.ENTRIES,
+        *tracking.entries(data),
+    ]
+
+
+def _drawn(entries: Iterable[FigureEntry], data: xr.Dataset | None, out: str | Path) -> list[Path]:
     return [path for entry in entries for path in style.save(entry.draw(data), out, entry.name)]
-
-
-def draw_study(folder: str | Path, study: str) -> list[Path]:
-    """Draw every figure of a study of the catalogue into the ``figures`` folder of its folder; the files written."""
-    ids = [id for id, entry in FIGURES.items() if entry.study == study]
-    return draw(ids, folder, Path(folder) / "figures")
 
 
 def _check_finished(entries: list[FigureEntry], data: xr.Dataset) -> None:

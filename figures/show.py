@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from figures import closed_loop, panels, style
 from figures.explore import is_comparison
 from figures.sweep import wear
-from figures.thesis.soft import cost
 from jaxmpc.errors import InputError
 from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.problem.tuning import Tuning
@@ -43,7 +42,7 @@ def plot(thing: Any, *, tuning: Tuning | None = None, structure: Any = None) -> 
     Args:
         thing: `StepResponseModel` (each step response), `Tuning` (cost of a deviation per CV), `Plan` (predicted CVs,
             planned MVs), `Trajectory`, or a study: the path of its store or what `open_study` or
-            `open_results` gave (sweeps: choke wear against deviation).
+            `open_results` gave (sweeps: travel of an MV against deviation).
         tuning: of a trajectory, for its deadzones.
         structure: of a tuning or a plan, for names and units.
 
@@ -99,6 +98,14 @@ def _tuning(tuning: Tuning, structure: Any) -> Panels:
         ax.set_ylabel("cost of one sample [1]")
         ax.legend(loc="upper center")
     return axes
+
+
+def cost(
+    deviation: np.ndarray, weight: float, quadratic: float, linear: float, deadzone: float
+) -> np.ndarray:
+    """What the deviation of one sample costs in (6.6): Q d^2 + S eta^2 + s eta with eta = max(|d| - c, 0)."""
+    eta = np.maximum(np.abs(deviation) - deadzone, 0.0)
+    return weight * deviation**2 + quadratic * eta**2 + linear * eta
 
 
 def _plan(plan: Any, structure: Any) -> Panels:

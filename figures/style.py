@@ -31,14 +31,10 @@ CONTROLLER_COLOURS = {
     ("continuous", "step"): VERMILLION,
     ("mixed-integer", "step"): GREEN,
 }
-SPARE_COLOURS = (PURPLE, ORANGE, SKY)
-# of a tuning that is compared with that of the thesis under the same controller
-TUNING_COLOURS = {"no-soft": PURPLE, "no-soft-plain": SKY}
+SPARE_COLOURS = (PURPLE, SKY, ORANGE)
 PLAN = ORANGE  # what a controller intends: plans and predictions, and the run that only carries one out
 SERIES = ((BLUE, "-"), (ORANGE, "--"), (GREEN, "-."))  # three curves of one kind
 VERDICT_COLOURS = {"holds": GREEN, "holds in part": ORANGE, "does not hold": VERMILLION, "not tested": GREY}
-
-NAMES = {"gas_rate": "gas rate", "oil_rate": "oil rate", "choke": "choke", "gas_lift": "gas lift"}
 
 RC: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -130,17 +126,17 @@ def unit(text: str) -> str:
 
 def printed(text: str) -> str:
     """A sentence with its units as they are printed."""
-    return text.replace("m3/h", "m³/h").replace(" %", "\N{NO-BREAK SPACE}%")
+    return re.sub(r"\bm3\b", "m³", text).replace(" %", "\N{NO-BREAK SPACE}%")
 
 
 def name_of(channel: str) -> str:
-    """A CV or MV in words."""
-    return NAMES.get(channel, channel.replace("_", " "))
+    """The name of a CV or MV in words."""
+    return channel.replace("_", " ")
 
 
-def label(channel: str, unit_text: str, what: str = "") -> str:
-    """An axis label with its unit: ``gas rate [m³/h]``, ``choke move [%]``."""
-    return f"{name_of(channel)}{what} [{unit(unit_text)}]"
+def label(words: str, unit_text: str) -> str:
+    """An axis label with its unit: ``flow rate [m³/h]``, ``valve move [%]``."""
+    return f"{words} [{unit(unit_text)}]"
 
 
 def minus(text: str) -> str:

@@ -1,4 +1,4 @@
-"""What the figures of a sweep study need to know of its store: what varies, which runs are there, which is the thesis's.
+"""What the figures of a sweep study need to know of its store: what varies, which runs are there, which is the default.
 
 A study is recognised by its columns and not by its name, so that any study with such columns gets the same figures.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +16,18 @@ import xarray as xr
 
 from figures import style
 from jaxmpc.errors import InputError
-from studies.definition.fields import FIELDS, as_text
+from jaxmpc.process.process import Mv, Process
+from studies.definition.fields import as_text, study_fields
 from studies.store.layout import FLAG
+from studies.store.process import process_in
 from studies.store.reading import open_study, provenance
-from studies.thesis.well import TUNINGS
 
 CONTROLLER = ("controller", "actuator")
 STRUCTURE = ("blocking", "blocks", "prediction_horizon", "control_horizon")
 TUNING = (*STRUCTURE, "preset", "soft", "first_penalised", "mean_move_window", "mean_move_mode")
 UNCERTAIN = ("plant.", "plant_scale.", "noise.", "disturbance.", "seed")
-DECIDING = ("tuning.deadzone.gas_rate", "tuning.deadzone.oil_rate", "tuning.move_weight.choke")
-THESIS_DEADZONE = TUNINGS["thesis"]["deadzone"]  # by CV [m3/h]
+ACTUATORS = {"step": "stepped", "continuous": "continuous"}  # in words
+SETTLED = "settled width"  # what deviations of CVs with different units are divided by
 EVEN = 1.5  # largest over smallest distance of values that count as evenly spaced
 UNEVEN = 4.0  # beyond it on both scales, values are drawn at equal distances
 
@@ -48,7 +49,7 @@ class SweepAxis:
 
     @property
     def uncertain(self) -> bool:
-        """Whether it is what a controller does not choose: well, noise, disturbance."""
+        """Whether it is what a controller does not choose: plant, noise, disturbance."""
         return self.key.startswith(UNCERTAIN)
 
     @property
@@ -101,27 +102,52 @@ def load(store: str | Path) -> xr.Dataset:
 
 
 def figure_of(data: xr.Dataset, name: str) -> xr.DataArray:
-    """A key figure over the scenarios, or an `InputError` that names it."""
+    """A key figure over the scenarios, or an `InputError` that names it.
+
+    ``NAME.CHANNEL`` is that of one CV or MV; one per MV without a channel that of `shown_mv`.
+    """
+    name, _, channel = name.partition(".")
     if name not in data.data_vars:
         raise InputError(name, sorted(map(str, data.data_vars)), f"the key figure {name} in the store")
-    return data[name]
+    values = data[name]
+    if "mv" in values.dims and not channel:
+        channel = shown_mv(process_in(data)).name
+    if not channel:
+        return values
+    axis = str(values.dims[-1])
+    if axis not in ("cv", "mv") or channel not in values[axis].values:
+        known = ", ".join(map(str, values[axis].values)) if axis in ("cv", "mv") else "no channel"
+        raise InputError(name, channel, f"one of {known}")
+    return values.sel({axis: channel})
+
+
+def shown_mv(process: Process) -> Mv:
+    """The MV whose moves a figure shows: the first with a stepped actuator, or the first where there is none."""
+    return process.mvs[next(iter(process.stepped), 0)]
 
 
 def deviation(data: xr.Dataset, cv: str | None = None, name: str = "mean_absolute_deviation") -> xr.DataArray:
-    """A deviation per scenario: of one CV in its unit, or the mean over the CVs of deviation / thesis deadzone [1]."""
+    """A deviation per scenario: of one CV in its unit, or the mean over the CVs of deviation / settled width [1]."""
     values = figure_of(data, name)
     if cv is not None:
         return values.sel(cv=cv)
-    scale = xr.DataArray([THESIS_DEADZONE[str(name)] for name in data.cv.values], dims="cv")
+    settled = {known.name: known.settled for known in process_in(data).cvs}
+    scale = xr.DataArray([settled[str(name)] for name in data.cv.values], dims="cv")
     return (values / scale).mean("cv", skipna=False)
 
 
-def quantities(data: xr.Dataset, cvs: Sequence) -> list[tuple[str, np.ndarray]]:
-    """What a tuning trades: choke travel and the mean deviation of each CV, with the titles of their axes."""
-    out = [("choke travel [%]", figure_of(data, "choke_travel").values)]
-    for cv in map(str, cvs):
-        units = style.unit(str(data.cv_unit.sel(cv=cv).item()))
-        out.append((f"mean deviation, {style.name_of(cv)} [{units}]", deviation(data, cv).values))
+def travel_title(mv: Mv) -> str:
+    """Of an axis with the travel of an MV."""
+    return style.label(f"{mv.label} travel", mv.unit)
+
+
+def quantities(data: xr.Dataset) -> list[tuple[str, np.ndarray]]:
+    """What a tuning trades: travel of `shown_mv` and the mean deviation of each CV, with the titles of their axes."""
+    process = process_in(data)
+    mv = shown_mv(process)
+    out = [(travel_title(mv), figure_of(data, f"travel.{mv.name}").values)]
+    for cv in process.cvs:
+        out.append((style.label(f"mean deviation, {cv.label}", cv.unit), deviation(data, cv.name).values))
     return out
 
 
@@ -182,7 +208,7 @@ def _decides(first: np.ndarray | None, second: np.ndarray) -> bool:
 
 
 def setting(data: xr.Dataset, key: str) -> Any:
-    """What the base of the study says of a key; its default if the base is silent, None if the store does not know."""
+    """What the base of the study says of a key, or its preset, or the default; None if the store does not know."""
     if key in data.coords:  # an axis of one value
         return data[key].values[0]
     definition = provenance(data, "definition")
@@ -196,28 +222,42 @@ def setting(data: xr.Dataset, key: str) -> Any:
             body = body.get(name) if isinstance(body, dict) else None
         if body is not None:
             return body
-    return thesis_setting(key)
+    preset = setting(data, "preset") if key.startswith("tuning.") else None
+    return default_setting(process_in(data), key, preset)
 
 
-def thesis_setting(key: str):
-    """Value of a key in the thesis; None if a tuning does not fix it."""
+def default_setting(process: Process, key: str, preset: str | None = None) -> Any:
+    """Value of a key where a study names at most a preset; None where nothing fixes it."""
     section, _, rest = key.partition(".")
     field, _, channel = rest.partition(".")
-    if section == "tuning" and field in TUNINGS["thesis"]:
-        value = TUNINGS["thesis"][field]
-        return value[channel] if channel else value
-    return FIELDS[key].default if key in FIELDS else None
+    if section == "tuning" and channel:
+        names = process.cv_names if channel in process.cv_names else process.mv_names
+        values = getattr(process.tuning(process.structure(), preset), field, None)
+        return (
+            float(np.asarray(values)[names.index(channel)])
+            if values is not None and channel in names
+            else None
+        )
+    fields = study_fields(process, ())
+    return fields[key].default if key in fields else None
 
 
-def thesis_tuning(data: xr.Dataset) -> np.ndarray:
-    """Which scenarios have the tuning and blocking of the thesis, ``"scenario"``; none in a study that varies neither."""
-    found = columns(data)
+def default_tuning(data: xr.Dataset) -> np.ndarray:
+    """Which scenarios have the first preset and the blocking of the process; none in a study that varies neither.
+
+    Returns:
+        ``"scenario"``.
+    """
+    process, found = process_in(data), columns(data)
     varied = [key for key in found if key in TUNING or key.startswith("tuning.")]
+    deciding = [f"tuning.deadzone.{cv}" for cv in process.cv_names] + [
+        f"tuning.move_weight.{mv.name}" for mv in process.mvs
+    ]
     mask = np.full(data.sizes["scenario"], bool(varied))
-    for key in dict.fromkeys((*varied, *DECIDING, "preset", "soft")):
-        value, wanted = found[key] if key in found else setting(data, key), thesis_setting(key)
+    for key in dict.fromkeys((*varied, *deciding, "preset", "soft")):
+        value, wanted = found[key] if key in found else setting(data, key), default_setting(process, key)
         if value is None:  # nothing can be said without those that decide
-            mask &= key not in DECIDING
+            mask &= key not in deciding
         elif wanted is not None:
             each = np.broadcast_to(value, mask.shape)
             mask &= [one == (as_text(wanted) if isinstance(one, str) else wanted) for one in each]
@@ -225,23 +265,28 @@ def thesis_tuning(data: xr.Dataset) -> np.ndarray:
 
 
 def controller_of(data: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Kind of the controller and kind of the choke actuator of each scenario."""
+    """Kind of the controller and ``step`` or ``continuous`` actuators of each scenario."""
+    fields = study_fields(process_in(data), ())
 
     def of(key: str) -> np.ndarray:
         if key in data.coords:
             return data[key].values
-        return np.full(data.sizes["scenario"], setting(data, key) or FIELDS[key].default, dtype=object)
+        return np.full(data.sizes["scenario"], setting(data, key) or fields[key].default, dtype=object)
 
     return of(CONTROLLER[0]), of(CONTROLLER[1])
 
 
 def controllers(data: xr.Dataset) -> np.ndarray:
-    """The controller of each scenario in words; the choke only where it varies."""
+    """The controller of each scenario in words; its actuators only where they vary."""
     kind, actuator = controller_of(data)
-    words = [f"{one} MPC" for one in kind]
-    if len(set(actuator.tolist())) > 1:
-        words = [f"{word}, {one} choke" for word, one in zip(words, actuator, strict=True)]
+    vary = len(set(actuator.tolist())) > 1
+    words = [controller_words(*one) if vary else f"{one[0]} MPC" for one in zip(kind, actuator, strict=True)]
     return np.array(words, dtype=object)
+
+
+def controller_words(kind: str, actuator: str) -> str:
+    """A controller and its actuators: ``mixed-integer MPC, stepped actuators``."""
+    return f"{kind} MPC, {ACTUATORS.get(actuator, actuator)} actuators"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -267,6 +312,6 @@ def variants(data: xr.Dataset, axes: list[SweepAxis]) -> list[Variant]:
         colour = style.colour(str(kind[rows[0]]), str(actuator[rows[0]]), i)
         if colour in [known.colour for known in out]:  # the controller alone does not tell them apart
             colour = style.SPARE_COLOURS[i % len(style.SPARE_COLOURS)]
-        label = ", ".join(words) or f"{kind[rows[0]]} MPC, {actuator[rows[0]]} choke"
+        label = ", ".join(words) or controller_words(str(kind[rows[0]]), str(actuator[rows[0]]))
         out.append(Variant(label, colour, rows))
     return out

@@ -1,7 +1,7 @@
 """All figures of a sweep study from its store; nothing here solves anything.
 
 Which figures there are follows from what varies: ``pareto`` always, ``maps`` over two numeric axes, ``mismatch`` for models
-and operating regions, ``blocking`` for blocks and horizons, ``fan`` and ``distributions`` for many wells or noises.
+and references, ``blocking`` for blocks and horizons, ``fan`` and ``distributions`` for many plants or noises.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Monte Carlo studies: bands of the CVs and the choke over time, and how wear and deviation are distributed."""
+"""Monte Carlo studies: bands of the CVs and an MV over time, and how travel and deviation are distributed."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from matplotlib.patches import Patch
 
 from figures import panels, style
 from figures.sweep import sheet
-from figures.sweep.data import SweepAxis, Variant, quantities, variants
+from figures.sweep.data import SweepAxis, Variant, quantities, shown_mv, variants
 from figures.sweep.wear import SPREAD
-from studies.thesis.well import CHOKE
+from studies.store.process import process_in
 
 FEWEST = 8  # scenarios of a variant, for a distribution
 MOST = 4  # variants in one figure
@@ -27,7 +27,7 @@ ROWS = 64  # scenarios whose trajectories are read at once
 
 
 def monte_carlo(data: xr.Dataset, axes: list[SweepAxis]) -> list[Variant]:
-    """The variants to draw: many wells or noises each, few variants, one with setpoints in common; empty otherwise."""
+    """The variants to draw: many plants or noises each, few variants, one with setpoints in common; empty otherwise."""
     if not any(axis.uncertain for axis in axes):
         return []
     found = variants(data, axes)
@@ -36,7 +36,7 @@ def monte_carlo(data: xr.Dataset, axes: list[SweepAxis]) -> list[Variant]:
 
 
 def has_trajectories(data: xr.Dataset) -> bool:
-    """Whether CVs and the choke are stored over time."""
+    """Whether CVs and MVs are stored over time."""
     return all(name in data.data_vars for name in ("measurement", "position"))
 
 
@@ -48,8 +48,8 @@ def bands(values: np.ndarray) -> np.ndarray:
 
 
 def fan(data: xr.Dataset, found: list[Variant]) -> Figure:
-    """Median and bands of each CV and of the choke over time, a column of panels per variant."""
-    channels = [*panels.cv_names(data), CHOKE]
+    """Median and bands of each CV and of `shown_mv` over time, a column of panels per variant."""
+    channels = [*panels.cv_names(data), shown_mv(process_in(data)).name]
     width = 7.6 if len(found) < 3 else 3.4 * len(found)
     height = 1.75 * len(channels) + 1.2
     drawn, grid = style.grid(len(channels), len(found), width, height, sharex=True, sharey="row")
@@ -106,8 +106,8 @@ def shares(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def distributions(data: xr.Dataset, found: list[Variant]) -> Figure:
-    """Sorted choke travel and deviations, a line per variant; the worst run of each is named, with its command."""
-    shown = quantities(data, panels.cv_names(data))
+    """Sorted travel and deviations, a line per variant; the worst run of each is named, with its command."""
+    shown = quantities(data)
     drawn, grid = style.grid(1, len(shown), 3.1 * len(shown), 3.9, sharey=True)
     said = []
     for ax, (title, values) in zip(grid[0], shown, strict=True):

@@ -1,8 +1,7 @@
-"""Heat maps of a sweep study: key figures over two numeric axes, or over working points of the model and regions."""
+"""Heat maps of a sweep study: key figures over two numeric axes, or over working points of the model and references."""
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import numpy as np
@@ -17,16 +16,22 @@ from matplotlib.patches import Rectangle
 from figures import style
 from figures.sweep import sheet
 from figures.sweep.data import (
+    ACTUATORS,
+    SETTLED,
     SweepAxis,
     controller_of,
+    controller_words,
+    default_tuning,
     deviation,
     figure_of,
     quantities,
     rows_by,
+    shown_mv,
     sweep_axes,
-    thesis_tuning,
+    travel_title,
 )
 from figures.sweep.wear import MAP, linked_sentences
+from studies.store.process import process_in
 
 LONGEST = 40  # values along an axis
 FILLED = 0.5  # of the cells, else the two axes are no grid
@@ -51,8 +56,8 @@ def controller_parts(data: xr.Dataset) -> list[tuple[str, str, xr.Dataset]]:
     parts = rows_by(*controller_of(data))
     out = []
     for (kind, actuator), rows in parts.items():
-        name = f"_{kind}_{actuator}_choke".replace("-", "_") if len(parts) > 1 else ""
-        out.append((f"{kind} MPC, {actuator} choke", name, data.isel(scenario=rows)))
+        name = f"_{kind}_{ACTUATORS.get(actuator, actuator)}".replace("-", "_") if len(parts) > 1 else ""
+        out.append((controller_words(kind, actuator), name, data.isel(scenario=rows)))
     return out
 
 
@@ -67,11 +72,12 @@ def cells(values: np.ndarray, at: list[tuple[np.ndarray, list]]) -> np.ndarray:
 
 
 def draw(data: xr.Dataset, axes: tuple[SweepAxis, SweepAxis], label: str = "") -> Figure:
-    """Choke travel, reversals, and the mean deviation of each CV over a horizontal and a vertical axis; one controller."""
+    """Travel and reversals of `shown_mv` and the mean deviation of each CV over two axes; one controller."""
     across, up = axes
-    shown = quantities(data, data.cv.values)
-    shown.insert(1, ("choke reversals [1]", figure_of(data, "choke_reversals").values))
-    mark = np.flatnonzero(thesis_tuning(data))
+    process = process_in(data)
+    shown, mv = quantities(data), shown_mv(process)
+    shown.insert(1, (f"{mv.label} reversals [1]", figure_of(data, f"reversals.{mv.name}").values))
+    mark = np.flatnonzero(default_tuning(data))
     rows = (len(shown) + 1) // 2
     drawn, grid = style.grid(rows, 2, 9.0, 3.05 * rows + 0.7)
     for i, (ax, (title, values)) in enumerate(zip(grid.flat, shown, strict=False)):
@@ -88,7 +94,7 @@ def draw(data: xr.Dataset, axes: tuple[SweepAxis, SweepAxis], label: str = "") -
             outline(ax, *borders, [axis.unique.index(axis.values[mark[0]]) for axis in axes])
     for spare in grid.flat[len(shown) :]:
         spare.set_visible(False)
-    framed = "Framed: the tuning of the thesis." if len(mark) else ""
+    framed = f"Framed: {process.default_preset} tuning." if len(mark) else ""
     sheet.write(drawn, data, [_caption(data, axes, label), framed, *linked_sentences(data)])
     return drawn
 
@@ -181,52 +187,63 @@ def colours(values: np.ndarray) -> Normalize:
     return Normalize(low, high if high > low else low + 1)
 
 
+def model_axes(axes: list[SweepAxis]) -> list[SweepAxis]:
+    """The first two coordinates of the working point of the model that vary: for columns, then for rows of a reference."""
+    return [axis for axis in axes if axis.key.startswith("model.")][:2]
+
+
 def is_mismatch(axes: list[SweepAxis]) -> bool:
-    """Whether the working point of the model and the operating region vary."""
-    keys = {axis.key for axis in axes}
-    return "reference" in keys and bool(keys & {"model.choke", "model.lift"})
+    """Whether the working point of the model and the reference vary."""
+    return "reference" in [axis.key for axis in axes] and bool(model_axes(axes))
 
 
 def mismatch(data: xr.Dataset) -> Figure:
-    """Deviation and choke travel by working point of the model and operating region, a row of panels per controller."""
-    parts = controller_parts(data)
-    found = {axis.key: axis for axis in sweep_axes(data)}
-    key = "model.choke" if "model.choke" in found else "model.lift"
-    regions, points = found["reference"].unique, found[key].unique
-    lifts = found["model.lift"].unique if key == "model.choke" and "model.lift" in found else []
-    steps = max(len(lifts), 1)  # rows of a region
-    titles = ("deviation / thesis deadzone, mean of the CVs [1]", "choke travel [%]")
+    """Deviation and travel by working point of the model and reference, a row of panels per controller."""
+    parts, known = controller_parts(data), sweep_axes(data)
+    mv = shown_mv(process_in(data))
+    reference = next(axis for axis in known if axis.key == "reference")
+    column, *inner = model_axes(known)
+    regions, points = reference.unique, column.unique
+    within = inner[0].unique if inner else []
+    steps = max(len(within), 1)  # rows of a reference
     height = max(len(parts) * (0.21 * steps * len(regions) + 0.55), 2.0)
     drawn, grid = style.grid(len(parts), 2, 9.0, height + 1.5, sharex=True, sharey=True)
     y, x = (np.arange(count, dtype=float) for count in (steps * len(regions), len(points)))
     holes = bool(data.attrs.get("missing"))
-    travel = functools.partial(figure_of, name="choke_travel")
-    for column, (title, quantity) in enumerate(zip(titles, (deviation, travel), strict=True)):
-        norm = colours(quantity(data).values)
-        holes = holes or not np.isfinite(quantity(data).values).all()
+    shown = (
+        (f"deviation / {SETTLED}, mean of the CVs [1]", deviation(data)),
+        (
+            travel_title(mv),
+            figure_of(data, f"travel.{mv.name}"),
+        ),
+    )
+    for i, (title, quantity) in enumerate(shown):
+        norm = colours(quantity.values)
+        holes = holes or not np.isfinite(quantity.values).all()
         mesh: Any = None
-        for ax, (label, _, part) in zip(grid[:, column], parts, strict=True):
+        for ax, (label, _, part) in zip(grid[:, i], parts, strict=True):
             where = steps * np.array([regions.index(region) for region in part.reference.values])
-            if lifts:
-                where = where + np.searchsorted(lifts, part["model.lift"].values)
-            table = cells(quantity(part).values, [(where, y.tolist()), (part[key].values, points)])
+            if inner:
+                where = where + np.searchsorted(within, part[inner[0].key].values)
+            values = quantity.sel(scenario=part.scenario).values
+            table = cells(values, [(where, y.tolist()), (part[column.key].values, points)])
             mesh = heat(ax, table, (edges(x, "equal"), edges(y, "equal")), (x, y), norm, size=6)
             for border in range(1, len(regions)):
                 ax.axhline(border * steps - 0.5, color="white", linewidth=2.5)
-            ax.set_title(label if column == 0 else " ", loc="left", fontsize=9)
+            ax.set_title(label if i == 0 else " ", loc="left", fontsize=9)
             ax.set_xticks(x, [f"{v:g}" for v in points])
             ax.tick_params(length=0)
-        grid[-1, column].set_xlabel(found[key].title)
-        sheet.colour_bar(mesh, grid[:, column], title, location="top", aspect=40, pad=0.02)
+        grid[-1, i].set_xlabel(column.title)
+        sheet.colour_bar(mesh, grid[:, i], title, location="top", aspect=40, pad=0.02)
     for ax in grid[:, 0]:
-        ax.set_yticks(y, [f"{lift:g}" for lift in lifts] * len(regions) if lifts else [""] * len(y))
+        ax.set_yticks(y, [f"{value:g}" for value in within] * len(regions) if inner else [""] * len(y))
         for i, region in enumerate(regions):
-            place = (-0.13 if lifts else -0.02, i * steps + (steps - 1) / 2)
+            place = (-0.13 if inner else -0.02, i * steps + (steps - 1) / 2)
             look: dict[str, Any] = {"ha": "right", "va": "center", "fontsize": 8.5}
             ax.annotate(str(region), place, xycoords=("axes fraction", "data"), **look)
-    median = _median(data, {"controller", "reference", key, "model.lift"})
+    median = _median(data, {"controller", "reference", column.key, *(axis.key for axis in inner)})
     words = [
-        f"Rows: operating region{', in it the gas lift of the working point [m3/h]' * (steps > 1)}.",
+        f"Rows: {reference.label}{f', in it {inner[0].label} [{inner[0].unit}]' if inner else ''}.",
         "One colour scale for all controllers." * (len(parts) > 1),
         f"M{median[1:]}." if median else "",
         "Empty: no finite figure." * holes,

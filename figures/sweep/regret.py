@@ -15,8 +15,9 @@ from matplotlib.ticker import MaxNLocator
 
 from figures import panels, style
 from figures.sweep import sheet
-from figures.sweep.data import STRUCTURE, columns, figure_of, rows_by, setting, thesis_setting
+from figures.sweep.data import STRUCTURE, columns, default_setting, figure_of, rows_by, setting
 from studies.definition.fields import as_text
+from studies.store.process import process_in
 
 COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.ORANGE, style.PURPLE, style.SKY, style.GREY)
 MODES = {"moves": "o", "inputs": "s", "none": "^"}
@@ -34,7 +35,7 @@ class Blocking:
     horizon: int  # of the prediction [samples]
     unknowns: int  # moves that are decided at each sample, of all MVs
     rows: np.ndarray  # positions of its scenarios
-    thesis: bool  # whether it is the blocking of the thesis
+    default: bool  # whether it is the blocking of the process
 
     @property
     def label(self) -> str:
@@ -52,20 +53,21 @@ def blockings(data: xr.Dataset) -> list[Blocking]:
     """Every combination of mode, blocks and horizons in the study."""
     found = columns(data)
     keys = [key for key in STRUCTURE if key in found]
-    thesis = {key: thesis_setting(key) for key in STRUCTURE}
+    process = process_in(data)
+    usual = {key: default_setting(process, key) for key in STRUCTURE}
     out = []
     for one, rows in rows_by(*(found[key].tolist() for key in keys)).items():
         given = dict(zip(keys, one, strict=True))
-        full: dict[str, Any] = {key: given.get(key) or setting(data, key) or thesis[key] for key in STRUCTURE}
+        full: dict[str, Any] = {key: given.get(key) or setting(data, key) or usual[key] for key in STRUCTURE}
         written = as_text(full["blocks"] if full["blocks"] is not None else "").split(";")
-        lengths, mvs = [[int(v) for v in own.split()] for own in written], data.sizes.get("mv", 2)
+        lengths, mvs = [[int(v) for v in own.split()] for own in written], len(process.mvs)
         blocks, horizon = max(map(len, lengths)), int(full["prediction_horizon"])
         unknowns = sum(map(len, lengths)) * (mvs if len(lengths) == 1 else 1)
         if full["blocking"] == "none":
             blocks = int(full["control_horizon"] or 0) or sum(lengths[0])
             unknowns = blocks * mvs
-        same = all(as_text(full[key]) == as_text(thesis[key]) for key in ("blocking", "blocks"))
-        same = same and horizon == thesis["prediction_horizon"]
+        same = all(as_text(full[key]) == as_text(usual[key]) for key in ("blocking", "blocks"))
+        same = same and horizon == usual["prediction_horizon"]
         out.append(Blocking(str(full["blocking"]), blocks, horizon, unknowns, rows, same))
     return out
 
@@ -73,19 +75,19 @@ def blockings(data: xr.Dataset) -> list[Blocking]:
 def regret(data: xr.Dataset, variants: list[Blocking]) -> tuple[np.ndarray, str]:
     """Closed-loop cost above that of the reference in otherwise equal runs [%], ``"scenario"``, and what the reference is.
 
-    The reference is the blocking of the thesis if it is among the variants, else the best of the equal runs. NaN where
+    The reference is the blocking of the process if it is among the variants, else the best of the equal runs. NaN where
     the reference run is missing.
     """
     cost = figure_of(data, "closed_loop_cost").values
     context = [values.tolist() for key, values in columns(data).items() if key not in STRUCTURE]
-    thesis = next((variant.rows for variant in variants if variant.thesis), None)
+    usual = next((variant.rows for variant in variants if variant.default), None)
     against = np.full(len(cost), np.nan)
     for rows in rows_by(*context).values() if context else [np.arange(len(cost))]:
-        base = cost[rows if thesis is None else np.intersect1d(rows, thesis)]
+        base = cost[rows if usual is None else np.intersect1d(rows, usual)]
         base = base[~np.isnan(base)]
         if len(base):
-            against[rows] = base.min() if thesis is None else base[-1]
-    return 100 * (cost / against - 1), "the best blocking" if thesis is None else "the thesis blocking"
+            against[rows] = base.min() if usual is None else base[-1]
+    return 100 * (cost / against - 1), "the best blocking" if usual is None else "the default blocking"
 
 
 def quartiles(values: np.ndarray) -> np.ndarray:
@@ -128,9 +130,9 @@ def draw(data: xr.Dataset) -> Figure:
     modes = list(dict.fromkeys(variant.mode for variant in variants))
     grey: dict[str, Any] = {"linestyle": "none", "color": "#666666", **POINT}
     handles = [Line2D([], [], marker=MODES.get(mode, "D"), **grey, label=mode) for mode in modes]
-    if any(variant.thesis for variant in variants):
+    if any(variant.default for variant in variants):
         look: dict[str, Any] = {**sheet.RING, "color": style.BLACK, "markersize": 10}
-        handles.append(Line2D([], [], **look, label="thesis"))
+        handles.append(Line2D([], [], **look, label="default"))
     panels.legend_above(first, 4, handles=handles)
     differ = [str(data[k].attrs.get("long_name", k)) for k in columns(data) if k not in STRUCTURE]
     words = (
@@ -153,7 +155,7 @@ def _point(ax: Axes, variant: Blocking, values, lost, colour: str) -> tuple[floa
     look |= {"elinewidth": 1.0, "ecolor": (colour, 0.4), "zorder": 3, **POINT}
     apart = [np.diff(at)[:, None] for at in (x, y)]
     ax.errorbar(x[1], y[1], xerr=apart[0], yerr=apart[1], **look)
-    if variant.thesis and np.isfinite((x[1], y[1])).all():
+    if variant.default and np.isfinite((x[1], y[1])).all():
         sheet.ring(ax, x[1], y[1], label=None, size=13)
     return x[1], y[1]
 

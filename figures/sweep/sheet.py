@@ -60,8 +60,8 @@ def colour_bar(mappable: Any, axes: Any, label: str = "", **options) -> Colorbar
     return bar
 
 
-def ring(axes: Axes, x, y, label: str | None = "thesis tuning", size: float = 11.0) -> None:
-    """Mark points with a ring, dark on light and light on dark, and name the first of them."""
+def ring(axes: Axes, x, y, label: str | None = None, size: float = 11.0) -> None:
+    """Mark points with a ring, dark on light and light on dark, and name the first of them if there is a label."""
     x, y = np.atleast_1d(x), np.atleast_1d(y)
     axes.plot(x, y, **RING, markersize=size, markeredgecolor="white", markeredgewidth=3.2, zorder=5)
     axes.plot(x, y, **RING, markersize=size, markeredgecolor=style.BLACK, markeredgewidth=1.3, zorder=5.1)

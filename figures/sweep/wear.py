@@ -1,4 +1,4 @@
-"""Choke wear against deviation from the setpoints: every scenario of a sweep study, and the front of the best ones."""
+"""Travel of an MV against deviation from the setpoints: every scenario of a sweep study, and the front of the best ones."""
 
 from __future__ import annotations
 
@@ -15,9 +15,20 @@ from matplotlib.lines import Line2D
 
 from figures import style
 from figures.sweep import sheet
-from figures.sweep.data import SweepAxis, axis_of, deviation, figure_of, load, sweep_axes, thesis_tuning
+from figures.sweep.data import (
+    SETTLED,
+    SweepAxis,
+    axis_of,
+    default_tuning,
+    deviation,
+    figure_of,
+    load,
+    shown_mv,
+    sweep_axes,
+)
 from jaxmpc.errors import InputError
 from studies.kpi.objectives import unbeaten
+from studies.store.process import process_in
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "d")
 COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, *style.SPARE_COLOURS)
@@ -41,7 +52,7 @@ def front(x, y) -> np.ndarray:
 @style.house_style
 def pareto(
     data: str | Path | xr.Dataset,
-    x: str = "choke_travel",
+    x: str = "travel",
     y: str = "mean_absolute_deviation",
     color: str | None = None,
     *,
@@ -49,13 +60,14 @@ def pareto(
     cv: str | None = None,
     axes: Axes | None = None,
 ) -> Axes:
-    """Scenarios as points, the front of those that none beats as a line, the thesis tuning with a ring.
+    """Scenarios as points, the front of those that none beats as a line, the first preset with a ring.
 
     Args:
         data: path of a store, what `studies.store.reading.open_study` gave, or finished scenarios of it.
-        x: key figure along the horizontal axis.
-        y: key figure along the vertical axis. One per CV is drawn for `cv`, or as the mean over the CVs; where
-            it has the unit of the CV, each is divided by its deadzone in the thesis (1000 and 5 m3/h) before.
+        x: key figure along the horizontal axis, ``NAME.CHANNEL`` for that of one CV or MV. One per MV is drawn for the
+            first MV with a stepped actuator, or the first where there is none.
+        y: key figure along the vertical axis. One per CV is drawn for `cv`, or as the mean over the CVs; where it has the
+            unit of the CV, each is divided by the half width in which its CV counts as settled before.
         color: column of the colours; the first one of numbers if not given.
         marker: column of the markers; the controller, another column of text, or the second one of numbers if not given.
         cv: name of a CV.
@@ -77,9 +89,9 @@ def pareto(
     best = best[np.lexsort((-up[best], across[best]))]
     axes.plot(across[best], up[best], color=style.BLACK, linewidth=1.0, zorder=2, label="front")
     _points(axes, across, up, coloured, shaped)
-    mark = thesis_tuning(data) & np.isfinite(across) & np.isfinite(up)
+    mark = default_tuning(data) & np.isfinite(across) & np.isfinite(up)
     if mark.any():
-        sheet.ring(axes, across[mark], up[mark])
+        sheet.ring(axes, across[mark], up[mark], f"{process_in(data).default_preset} tuning")
     for values, set_scale in ((across, axes.set_xscale), (up, axes.set_yscale)):
         if style.spans(values, SPREAD):
             set_scale("log")
@@ -92,16 +104,18 @@ def draw(data: xr.Dataset) -> Figure:
     """The figure of a study, from its finished scenarios."""
     drawn, ((axes,),) = style.grid(1, 1, 7.6, 5.3)
     pareto(data, axes=axes)
-    finite = np.isfinite(figure_of(data, "choke_travel").values) & np.isfinite(deviation(data).values)
-    lost = int((~finite).sum())
+    finite = np.isfinite(figure_of(data, "travel").values) & np.isfinite(deviation(data).values)
+    lost, process = int((~finite).sum()), process_in(data)
+    widths = ", ".join(f"{cv.label} {cv.settled:g} {cv.unit}".removesuffix(" 1") for cv in process.cvs)
     lines = [
         "One point per scenario; the line joins those that no other beats in both. The deviation of each CV is "
-        "divided by its deadzone in the thesis (1000 and 5 m3/h), then averaged.",
+        f"divided by the half width in which it counts as settled ({widths}), then averaged.",
         *linked_sentences(data),
         f"Not drawn, without finite figures: {lost} of the finished scenarios." if lost else "",
     ]
     sheet.write(drawn, data, lines)
-    axes.set_title("Choke wear against deviation", loc="left")
+    label = shown_mv(process).label
+    axes.set_title(f"{label[0].upper()}{label[1:]} travel against deviation", loc="left")
     return drawn
 
 
@@ -120,23 +134,29 @@ def linked_sentences(data: xr.Dataset) -> list[str]:
 def _figure(data: xr.Dataset, name: str, cv: str | None) -> tuple[np.ndarray, str]:
     """Values per scenario and the title of their axis."""
     values = figure_of(data, name)
-    words, units = str(values.attrs.get("long_name", name)), str(values.attrs.get("units", "1"))
+    bare = name.partition(".")[0]
+    words, units = str(values.attrs.get("long_name", bare)), str(values.attrs.get("units", "1"))
     if values.dims == ("scenario",):
-        return values.values.astype(float), f"{_TITLES.get(name, words)} [{style.unit(units)}]"
+        for axis in ("cv", "mv"):
+            if axis in values.coords:
+                channel = str(values[axis].item())
+                words = f"{process_in(data).labels[channel]} {_TITLES.get(bare, words)}"
+                units = units.replace(f"{axis}_unit", str(data[f"{axis}_unit"].sel({axis: channel}).item()))
+        return values.values.astype(float), style.label(words, units)
     if values.dims != ("scenario", "cv"):
         raise InputError(name, list(values.dims), "a key figure of the scenario, or one per CV")
     if cv is None:
         if "cv_unit" not in units:
             return values.mean("cv", skipna=False).values, f"{words}, mean of the CVs [{style.unit(units)}]"
         rest = style.unit(units.replace("cv_unit", "").strip() or "1")
-        return deviation(data, name=name).values, f"{_TITLES.get(name, words)} / thesis deadzone [{rest}]"
+        return deviation(data, name=name).values, f"{_TITLES.get(name, words)} / {SETTLED} [{rest}]"
     if cv not in data.cv.values:
         raise InputError("cv", cv, f"one of {', '.join(map(str, data.cv.values))}")
     shown = units.replace("cv_unit", str(data.cv_unit.sel(cv=cv).item()))
-    return values.sel(cv=cv).values, f"{words}, {style.name_of(cv)} [{style.unit(shown)}]"
+    return values.sel(cv=cv).values, f"{words}, {process_in(data).labels[cv]} [{style.unit(shown)}]"
 
 
-_TITLES = {"choke_travel": "choke travel", "mean_absolute_deviation": "mean absolute deviation"}
+_TITLES = {"travel": "travel", "mean_absolute_deviation": "mean deviation"}
 
 
 def _pick(data: xr.Dataset, known: list[SweepAxis], key: str) -> SweepAxis:

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from figures import panels, style
 from figures.figure import FigureEntry
-from studies.thesis.well import GAS, OIL
+from studies.thesis.well import GAS, OIL, WELL
 
 MARKERS = ("o", "s", "^")
 WORKING_CHOKE = 50.0  # %, where the model is identified
@@ -25,7 +25,7 @@ def draw(data: xr.Dataset, cv: str) -> Figure:
     axes.set_xlim(0, 100)
     axes.set_xlabel("choke position before the step [%]")
     per = f"{panels.unit_of(data, cv)} per %"
-    axes.set_ylabel(f"{style.name_of(cv)}: steady change\nper % of choke [{per}]")
+    axes.set_ylabel(f"{WELL.labels[cv]}: steady change\nper % of choke [{per}]")
     axes.legend()
     return drawn
 
@@ -36,7 +36,7 @@ def _caption(data: xr.Dataset, cv: str) -> str:
     at, lift = float(largest.sweep_choke.values[0]), largest.sweep_lift.values[0]
     working = float(curves.sel(sweep_lift=lift).interp(sweep_choke=WORKING_CHOKE).item())
     return (
-        f"The gain of the choke on the {style.name_of(cv)} depends on where it stands: at a lift of {lift:.0f} m³/h a "
+        f"The gain of the choke on the {WELL.labels[cv]} depends on where it stands: at a lift of {lift:.0f} m³/h a "
         f"step at {at:.0f} % does {float(curves.max()) / working:.1f} times as much as one at {WORKING_CHOKE:.0f} %, where "
         "the prediction model is identified."
     )
@@ -45,7 +45,7 @@ def _caption(data: xr.Dataset, cv: str) -> str:
 ENTRIES = tuple(
     FigureEntry(
         id,
-        f"{style.name_of(cv)}: steady-state step coefficients over the choke",
+        f"{WELL.labels[cv]}: steady-state step coefficients over the choke",
         "thesis",
         draw,
         _caption,

@@ -10,11 +10,12 @@ from matplotlib.figure import Figure
 
 from figures import panels, style
 from figures.figure import FigureEntry
+from figures.panels import between
 from figures.thesis import runs
-from figures.thesis.facts import between, settled
+from figures.thesis.facts import settled
 from jaxmpc.errors import InputError
 from studies.store.reading import provenance
-from studies.thesis.well import CHOKE, GAS, LIFT, OIL
+from studies.thesis.well import CHOKE, GAS, LIFT, OIL, WELL
 
 INTEGER = "mixed-integer"
 When = Callable[[xr.Dataset, str], float]
@@ -30,10 +31,15 @@ def retuned_at(data: xr.Dataset, controller: str) -> float:
 
 def disturbed_at(data: xr.Dataset, _controller: str = INTEGER) -> float:
     """When the reservoir pressure first leaves its nominal value [s]; an `InputError` if it never does."""
-    away = np.flatnonzero(data.disturbance.values != 0)
+    away = np.flatnonzero(offset(data).values != 0)
     if not len(away):
         raise InputError("results.disturbance", "0 bar throughout", "a run with a pressure offset")
     return float(data.time.values[away[0]])
+
+
+def offset(data: xr.Dataset) -> xr.DataArray:
+    """Offset of the reservoir pressure, ``"time"`` [bar]."""
+    return data.disturbance.sel(disturbance_name=WELL.disturbance_names[0])
 
 
 def rates(data: xr.Dataset, controller: str, when: When) -> Figure:
@@ -47,7 +53,7 @@ def inputs(data: xr.Dataset, controller: str, when: When) -> Figure:
 
 
 def _marked(drawn: Figure, data: xr.Dataset, at: float) -> Figure:
-    drop = float(data.disturbance.min())
+    drop = float(offset(data).min())
     words = style.minus(f"{drop:+g} bar") if drop else "gas weights zero"
     seconds = panels.time_unit(*panels.span(data))[0]
     for ax in drawn.axes:
@@ -61,9 +67,9 @@ def pressure(data: xr.Dataset) -> Figure:
     """A step plot over time: offset of the reservoir pressure."""
     drawn, (axes,) = style.figure(1, row_height=2.6)
     seconds = panels.time_axis(axes, *panels.span(data))
-    panels.step(axes, data, data.disturbance, seconds, color=style.BLACK)
+    panels.step(axes, data, offset(data), seconds, color=style.BLACK)
     axes.set_ylabel("reservoir pressure:\noffset from nominal [bar]")
-    panels.limits(axes, data.disturbance)
+    panels.limits(axes, offset(data))
     return drawn
 
 
@@ -105,7 +111,7 @@ def _inputs_caption(data: xr.Dataset, controller: str, when: When) -> str:
 
 def _pressure_caption(data: xr.Dataset) -> str:
     return (
-        f"The disturbance of figures 31 and 32: the reservoir pressure changes by {data.disturbance.min():+g} "
+        f"The disturbance of figures 31 and 32: the reservoir pressure changes by {float(offset(data).min()):+g} "
         f"bar at {disturbed_at(data):,.0f} s and stays there; the controller is not told."
     )
 

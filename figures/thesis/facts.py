@@ -6,9 +6,14 @@ import numpy as np
 import xarray as xr
 
 from studies.kpi import loop as kpi
-from studies.thesis.well import CHOKE
+from studies.thesis.well import CHOKE, GAS, OIL
 
 LATE = 600.0  # s at the end of a stretch that stand for what it settles at
+
+
+def oil_first(data: xr.Dataset) -> xr.Dataset:
+    """The results with their CVs in the order of the thesis's panels: oil above gas."""
+    return data.sel(cv=[OIL, GAS])
 
 
 def choke_moves(data: xr.Dataset, controller: str) -> np.ndarray:
@@ -35,12 +40,6 @@ def turns(data: xr.Dataset, controller: str, segment: np.ndarray) -> tuple[np.nd
 def times(count: int) -> str:
     """How often, in words."""
     return {0: "never", 1: "once", 2: "twice"}.get(count, f"{count} times")
-
-
-def between(data: xr.Dataset, start: float, end: float = np.inf, closed: bool = True) -> xr.Dataset:
-    """Samples from one time to another [s], that of the end included if `closed`."""
-    before = data.time.values <= end if closed else data.time.values < end
-    return data.isel(time=np.flatnonzero((data.time.values >= start) & before))
 
 
 def settled(data: xr.Dataset, controller: str) -> dict[str, float]:

@@ -67,7 +67,7 @@ def _reversal_bars(axes: Axes, data: xr.Dataset) -> None:
         run = figures.sel(controller=name)
         at = np.arange(windows) + (i - 0.5 * (len(names) - 1)) * width
         label = str(run.label.item()).replace("mixed-integer MPC", "MIMPC").replace("continuous MPC", "MPC")
-        axes.bar(at, run.late_reversals.values, width, color=COLOURS[name], label=label)
+        axes.bar(at, run.late_reversals.sel(mv=CHOKE).values, width, color=COLOURS[name], label=label)
     first = np.searchsorted(data.window.values, np.arange(windows))
     oil = data.setpoint.sel(cv=OIL).values[first]
     axes.set_xticks(np.arange(windows), [f"{value:g}" for value in oil])
@@ -79,7 +79,7 @@ def _reversal_bars(axes: Axes, data: xr.Dataset) -> None:
 
 
 def _caption(data: xr.Dataset) -> str:
-    late = key_figures(data).late_reversals.sum("window")
+    late = key_figures(data).late_reversals.sel(mv=CHOKE).sum("window")
     counts = "; ".join(
         f"{words} {int(late.sel(controller=one))} and {int(late.sel(controller=two))}"
         for words, (one, two) in PAIRS.items()

@@ -55,7 +55,7 @@ def opening(data: xr.Dataset) -> xr.Dataset:
 
 
 def _caption(data: xr.Dataset) -> str:
-    largest = key_figures(data).largest_mean_opening
+    largest = key_figures(data).largest_mean_rise.sel(mv=CHOKE)
     kinds = "; ".join(
         f"{kind} MPC {float(largest.sel(controller=f'{kind}-reactive')):.3f} and "
         f"{float(largest.sel(controller=f'{kind}-predictive')):.3f}"

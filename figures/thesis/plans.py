@@ -1,7 +1,6 @@
 """Thesis figures 25, 26 (a plan, and what came of it) and 36 to 38 (prediction against response in an oscillation).
 
-The past is white and what lies ahead grey. Plans come from `studies.plans`, which rebuilds them from what is stored;
-`draw_plan` is also what the app (`figures.explore`) shows of a plan.
+The past is white and what lies ahead grey; `figures.planned` draws it.
 """
 
 from __future__ import annotations
@@ -14,14 +13,13 @@ from matplotlib.figure import Figure
 
 from figures import panels, style
 from figures.figure import FigureEntry
-from figures.thesis.facts import between, turns
+from figures.planned import BEFORE, draw_plan, index_of
+from figures.thesis.facts import oil_first, turns
 from jaxmpc.errors import InputError
 from studies.plans import StoredPlan, plan_at
 from studies.thesis.reach import NEAR_CLOSED
 from studies.thesis.well import CHOKE, GAS, LIFT, OIL
 
-BEFORE = 600.0  # s of the past to show
-MINUTE = 60.0
 SWING = (300.0, 600.0)  # s, at least, to show before and after the moves of an oscillation
 WORDS = ("first", "second", "third")
 PREDICTED = "closed-loop"  # the controller of figures 25 to 28
@@ -29,12 +27,14 @@ PREDICTED = "closed-loop"  # the controller of figures 25 to 28
 
 def planned(data: xr.Dataset, controller: str) -> Figure:
     """Six plots over time: rates, inputs and their moves; past on white, a plan with its prediction on grey."""
+    data = oil_first(data)
     plan = plan_at(data, controller, first_change(data))
     return _six_panels(data, controller, plan, known=plan.time)
 
 
 def evolved(data: xr.Dataset, controller: str) -> Figure:
     """Six plots over time: rates, inputs and their moves; what happened, and the first plan dashed."""
+    data = oil_first(data)
     plan = plan_at(data, controller, first_change(data))
     return _six_panels(data, controller, plan, known=np.inf, grey=False, line="--")
 
@@ -42,7 +42,7 @@ def evolved(data: xr.Dataset, controller: str) -> Figure:
 def _six_panels(data: xr.Dataset, controller: str, plan: StoredPlan, **options: Any) -> Figure:
     start, end = panels.span(data)
     drawn, rows = style.grid(3, 2, 9.6, 6.5, sharex=True)
-    shown = max(plan.time - BEFORE, start), min(float(plan.cv_time[-1]), end)
+    shown = max(plan.time - BEFORE * plan.dt, start), min(float(plan.cv_time[-1]), end)
     draw_plan(rows, data, controller, plan, shown, **options)
     panels.shared_legend(drawn, rows.flat)
     return drawn
@@ -53,6 +53,7 @@ def swing(data: xr.Dataset, controller: str, which: int) -> Figure:
 
     `which` of the three moves of an oscillation: 0, 1 or 2.
     """
+    data = oil_first(data)
     moves = swing_moves(data, controller)
     plan = plan_at(data, controller, moves[which])
     length = moves[2] - moves[0]
@@ -64,69 +65,6 @@ def swing(data: xr.Dataset, controller: str, which: int) -> Figure:
     title = f"{WORDS[which]} turn: choke {size} % at {plan.time:,.0f} s"
     panels.shared_legend(drawn, rows.flat, title=title)
     return drawn
-
-
-def draw_plan(
-    rows: np.ndarray,
-    data: xr.Dataset,
-    controller: str,
-    plan: StoredPlan,
-    shown: tuple[float, float],
-    *,
-    known: float,
-    pale: bool = False,
-    grey: bool = True,
-    line: str = "-",
-) -> None:
-    """A plan with its prediction, and what happened.
-
-    Args:
-        rows: axes ``"row column"``: CVs, MVs, and in a third row, if there is one, the moves of the MVs.
-        data: results of `controller` among others.
-        controller: whose plan it is.
-        plan: to draw.
-        shown: start and end of the time axis [s].
-        known: time until which what happened is drawn [s].
-        pale: whether what happened later is drawn too, pale.
-        grey: whether what lies after the plan is grey.
-        line: of the plan.
-    """
-    whole, colour = between(data, *shown), panels.run_colour(data, controller)
-    # the CVs of the time `known` are measured, the moves are not made yet
-    parts = [(between(whole, 0.0, known), between(whole, 0.0, known, closed=False), "actual", 1.0)]
-    if pale:
-        parts.insert(0, (between(whole, known), between(whole, known), "_later", 0.4))
-    for ax in rows.flat:
-        panels.time_axis(ax, *shown, bins=8)
-        ax.set_xlabel("time [min]" if ax in rows[-1] else "")
-        ax.set_xlim(*np.array(shown) / MINUTE)
-        panels.mark(ax, plan.time / MINUTE)
-        if grey:
-            ax.axvspan(plan.time / MINUTE, shown[1] / MINUTE, color=style.FUTURE, linewidth=0, zorder=0)
-    look: dict[str, Any] = {"linestyle": line, "color": style.PLAN, "linewidth": 1.6, "label": "plan"}
-    inside = plan.cv_time <= shown[1]
-    for ax, cv in zip(rows[0], panels.cv_names(data), strict=False):
-        panels.deadzone_lines(ax, whole, controller, cv, MINUTE)
-        panels.setpoint(ax, whole, cv, MINUTE)
-        ax.plot(plan.cv_time[inside] / MINUTE, plan.cv[inside, index_of(data.cv, cv)], **look)
-        for seen, _, label, strength in parts:
-            panels.measured(ax, seen, controller, cv, MINUTE, label=label, alpha=strength)
-    t = np.append(plan.move_time, [plan.move_time[-1] + plan.dt, plan.cv_time[-1]]) / MINUTE
-    for column, mv in zip(rows[1:].T, panels.mv_names(data), strict=False):
-        i = index_of(data.mv, mv)
-        kinds = (("position", "", plan.mv, plan.mv[-1, i]), ("move", " move", plan.move, 0.0))
-        for ax, (name, words, values, after) in zip(column, kinds, strict=False):
-            ax.step(t, np.append(values[:, i], [after, after]), where="post", **look)
-            for _, made, label, strength in parts:
-                if made.sizes["time"]:
-                    done = made[name].sel(controller=controller, mv=mv)
-                    panels.step(ax, made, done, MINUTE, color=colour, alpha=strength, label=label)
-            ax.set_ylabel(panels.label_of(data, mv, words))
-
-
-def index_of(names: xr.DataArray, name: str) -> int:
-    """Position of a name in a coordinate."""
-    return [str(known) for known in names.values].index(name)
 
 
 def first_change(data: xr.Dataset) -> float:

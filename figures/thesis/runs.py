@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 
 from figures import panels, style
 from figures.figure import FigureEntry
-from figures.thesis.facts import between, choke_moves, reversals, times, turns
+from figures.panels import between
+from figures.thesis.facts import choke_moves, reversals, times, turns
 from jaxmpc.errors import InputError
 from studies.kpi import loop as kpi
 from studies.thesis.reach import NEAR_CLOSED
@@ -31,8 +32,8 @@ def rates(data: xr.Dataset, controller: str) -> Figure:
 
     Vertical limits hold every controller in `data`.
     """
-    drawn, axes, seconds = _stack(data, controller, data.sizes["cv"])
-    for ax, cv in zip(axes, panels.cv_names(data), strict=True):
+    drawn, axes, seconds = _stack(data, controller, 2)
+    for ax, cv in zip(axes, (OIL, GAS), strict=True):
         panels.controlled(ax, data, controller, cv, seconds)
         run = data.sel(controller=controller, cv=cv)
         half = panels.soft_half_width(run)
@@ -52,8 +53,8 @@ def inputs(data: xr.Dataset, controller: str) -> Figure:
 
 def bias(data: xr.Dataset, controller: str) -> Figure:
     """Filtered output bias of the oil rate above that of the gas rate over time."""
-    drawn, axes, seconds = _stack(data, controller, data.sizes["cv"])
-    for ax, cv in zip(axes, panels.cv_names(data), strict=True):
+    drawn, axes, seconds = _stack(data, controller, 2)
+    for ax, cv in zip(axes, (OIL, GAS), strict=True):
         panels.bias(ax, data, controller, cv, seconds)
         panels.limits(ax, data.bias.sel(cv=cv))
     return drawn

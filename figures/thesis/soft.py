@@ -8,15 +8,15 @@ from matplotlib.figure import Figure
 
 from figures import panels, style
 from figures.figure import FigureEntry
+from figures.show import cost
 from figures.thesis.facts import reversals, times
-from jaxmpc.process.well.equations import CV_NAMES, CV_UNITS
-from studies.thesis.well import CHOKE, GAS, OIL, TUNINGS
+from studies.thesis.well import CHOKE, GAS, OIL, WELL
 
 NOMINAL, SOFT = "nominal", "soft"
-PENALTIES = (  # preset, label, line
-    ("no-soft", "nominal", "-"),
-    ("no-soft-plain", "Soft MPC left out, weight unchanged", "-."),
-    ("thesis", "Soft MPC", "-"),
+PENALTIES = (  # preset, label, line, colour
+    ("no-soft", "nominal", "-", style.PURPLE),
+    ("no-soft-plain", "Soft MPC left out, weight unchanged", "-.", style.SKY),
+    ("thesis", "Soft MPC", "-", style.GREEN),
 )
 REACH = 4.0  # deadzone half widths to show
 
@@ -43,37 +43,28 @@ def penalties(_results=None) -> Figure:
     """Two plots, oil above gas: three parabola-like penalties over the deviation, the deadzone shaded."""
     drawn, axes = style.figure(2, row_height=2.6, sharex=False)
     for ax, cv in zip(axes, (OIL, GAS), strict=True):
-        unit = style.unit(CV_UNITS[CV_NAMES.index(cv)])
-        half = TUNINGS["thesis"]["deadzone"][cv]
+        unit = style.unit(WELL.units[cv])
+        half = WELL.presets["thesis"]["deadzone"][cv]
         deviation = np.linspace(-REACH * half, REACH * half, 401)
-        for preset, label, line in PENALTIES:
-            colour = style.TUNING_COLOURS.get(preset, style.CONTROLLER_COLOURS["mixed-integer", "step"])
+        for preset, label, line, colour in PENALTIES:
             ax.plot(deviation, penalty(preset, cv, deviation), line, color=colour, label=label)
         ax.axvspan(-half, half, color=style.BAND, linewidth=0, label=f"deadzone ±{half:g} {unit}")
         ax.set_xlim(deviation[0], deviation[-1])
         ax.set_ylim(bottom=0)
-        ax.set_xlabel(f"{style.name_of(cv)}: deviation from the setpoint [{unit}]")
+        ax.set_xlabel(f"{WELL.labels[cv]}: deviation from the setpoint [{unit}]")
         ax.set_ylabel("penalty of a sample [1]")
         ax.legend(loc="upper center")
     return drawn
 
 
 def penalty(preset: str, cv: str, deviation: np.ndarray) -> np.ndarray:
-    """What one sample costs with a preset of `studies.definition.presets.TUNINGS`; deviation in CV units."""
+    """What one sample costs with a preset of the well; deviation in CV units."""
     fields = ("cv_weight", "soft_quadratic", "soft_linear", "deadzone")
-    return cost(deviation, *(TUNINGS[preset][field][cv] for field in fields))
-
-
-def cost(
-    deviation: np.ndarray, weight: float, quadratic: float, linear: float, deadzone: float
-) -> np.ndarray:
-    """What the deviation of one sample costs in (6.6): Q d^2 + S eta^2 + s eta with eta = max(|d| - c, 0)."""
-    eta = np.maximum(np.abs(deviation) - deadzone, 0.0)
-    return weight * deviation**2 + quadratic * eta**2 + linear * eta
+    return cost(deviation, *(WELL.presets[preset][field][cv] for field in fields))
 
 
 def _penalties_caption(_results=None) -> str:
-    half = TUNINGS["thesis"]["deadzone"][OIL]
+    half = WELL.presets["thesis"]["deadzone"][OIL]
     at = np.array([half, 10 * half])
     inside, outside = 100 * penalty("thesis", OIL, at) / penalty("no-soft", OIL, at)
     return (

@@ -13,7 +13,7 @@ from figures import style
 from figures.figure import FigureEntry
 from jaxmpc.status import LIMIT
 from studies.kpi.evaluate import key_figures
-from studies.thesis.well import OIL
+from studies.thesis.well import CHOKE, OIL
 
 
 def draw(data: xr.Dataset) -> Figure:
@@ -26,7 +26,7 @@ def draw(data: xr.Dataset) -> Figure:
     away = figures.mean_absolute_deviation.sel(cv=OIL)
     ticks = ["none" if name == "exact" else f"{_milliseconds(name):g} ms" for name in order]
     for ax, values, form, colour, label in (
-        (travel, figures.choke_travel, "{:.0f}", style.GREEN, "choke travel [%]"),
+        (travel, figures.travel.sel(mv=CHOKE), "{:.0f}", style.GREEN, "choke travel [%]"),
         (deviation, away, "{:.2f}", style.BLUE, "mean absolute deviation, oil [m³/h]"),
     ):
         bars = ax.bar(np.arange(len(order)), values.values, 0.6, color=colour)

@@ -100,5 +100,5 @@ def test_figures_need_not_be_closed():
 
 
 def test_units_are_printed_as_readers_know_them():
-    assert style.label("oil_rate", "m3/h") == "oil rate [m³/h]"
+    assert style.label("oil rate", "m3/h") == "oil rate [m³/h]"
     assert np.all([len(colour) == 7 for colour in style.CONTROLLER_COLOURS.values()])

@@ -9,7 +9,7 @@ import pytest
 from figures import closed_loop, style
 from figures.sweep import draw as sweep
 from figures.sweep import fan, maps, regret, wear
-from figures.sweep.data import load, sweep_axes, thesis_tuning, variants
+from figures.sweep.data import default_tuning, load, sweep_axes, variants
 from jaxmpc.errors import InputError
 from studies.store.reading import open_study
 from tests import studies_synthetic as made
@@ -70,7 +70,7 @@ def caption(figure):
 
 
 def ring_points(axes):
-    """Where the rings of the thesis tuning are."""
+    """Where the rings of the default preset are."""
     rings = [line for line in axes.lines if line.get_markersize() > 10 and line.get_marker() == "o"]
     return {(float(x), float(y)) for line in rings for x, y in zip(*line.get_data(), strict=True)}
 
@@ -187,7 +187,7 @@ def test_equal_points_share_the_front_and_a_tie_in_one_is_beaten():
 def test_the_points_and_the_front_are_the_stored_numbers(deadzone):
     data = open_study(deadzone)
     axes = wear.pareto(data)
-    x = data.choke_travel.values
+    x = data.travel.sel(mv="choke").values
     y = (data.mean_absolute_deviation.values / (1000.0, 5.0)).mean(1)
     drawn = np.concatenate([np.asarray(points.get_offsets()) for points in axes.collections])
     assert {tuple(p) for p in np.round(drawn, 9)} == {tuple(p) for p in np.round(np.stack([x, y], 1), 9)}
@@ -219,14 +219,14 @@ def test_one_cv_and_another_colour_can_be_chosen(deadzone):
 
 def test_the_thesis_tuning_is_marked_where_it_is(deadzone):
     data = load(deadzone)
-    here = np.flatnonzero(thesis_tuning(data)).tolist()
+    here = np.flatnonzero(default_tuning(data)).tolist()
     assert here == [7]
     assert data["tuning.deadzone.gas_rate"].values[7] == 1000
     assert data["tuning.move_weight.choke"].values[7] == 250
     y = (data.mean_absolute_deviation.values[7] / (1000.0, 5.0)).mean()
-    assert ring_points(wear.pareto(data)) == {(float(data.choke_travel.values[7]), y)}
+    assert ring_points(wear.pareto(data)) == {(float(data.travel.values[7, 0]), y)}
     drawn = sweep.pages(data)["maps"]()
-    assert "tuning of the thesis" in caption(drawn)
+    assert "Framed: thesis tuning" in caption(drawn)
     frame = drawn.axes[0].patches[-1]
     assert frame.get_y() < 250 < frame.get_y() + frame.get_height()
 
@@ -244,10 +244,10 @@ def test_another_tuning_is_not_marked(tmp_path, oil, weights, definition):
     values = grid([(500, oil / 2), (1000, oil)], weights)
     keys = (DEADZONE, OIL_DEADZONE, WEIGHT)
     data = load(write(tmp_path / "a.zarr", keys, values, numbers(4), definition=definition))
-    assert not thesis_tuning(data).any()
+    assert not default_tuning(data).any()
     assert ring_points(wear.pareto(data)) == set()
     drawn = sweep.pages(data)["maps"]()
-    assert "tuning of the thesis" not in caption(drawn)
+    assert "Framed" not in caption(drawn)
     assert not drawn.axes[0].patches
 
 
@@ -259,11 +259,11 @@ def test_a_study_of_the_weight_alone_is_marked_only_if_its_base_has_the_thesis_d
     ):
         path = tmp_path / f"{name}.zarr"
         data = load(write(path, (WEIGHT,), [[62.5, 250]], numbers(2), definition=definition))
-        assert thesis_tuning(data).tolist() == [False, marked], name
+        assert default_tuning(data).tolist() == [False, marked], name
 
 
 def test_wells_that_differ_have_no_thesis_mark(tmp_path):
-    assert not thesis_tuning(load(monte_carlo(tmp_path / "a.zarr"))).any()
+    assert not default_tuning(load(monte_carlo(tmp_path / "a.zarr"))).any()
 
 
 # ------------------------------------------------------------------------------------------------ maps
@@ -275,7 +275,7 @@ def test_maps_show_the_stored_numbers_on_log_axes_where_values_are_log_spaced(de
     panels = [ax for ax in drawn.axes if ax.collections and ax.get_title(loc="left")]
     assert len(panels) == 4
     travel = np.asarray(panels[0].collections[0].get_array())
-    np.testing.assert_array_equal(travel, data.choke_travel.values.reshape(4, 3).T)
+    np.testing.assert_array_equal(travel, data.travel.values[:, 0].reshape(4, 3).T)
     oil = np.asarray(panels[3].collections[0].get_array())
     np.testing.assert_array_equal(oil, data.mean_absolute_deviation.values[:, 1].reshape(4, 3).T)
     assert panels[0].get_yscale() == "log"
@@ -291,7 +291,7 @@ def test_cells_are_medians_over_further_axes_and_the_caption_says_so(tmp_path):
     data = load(write(tmp_path / "a.zarr", (DEADZONE, WEIGHT, SEED), values, figures))
     drawn = sweep.pages(data)["maps"]()
     table = np.asarray(drawn.axes[0].collections[0].get_array())
-    np.testing.assert_allclose(table, np.median(figures["choke_travel"].reshape(2, 2, 3), axis=2).T)
+    np.testing.assert_allclose(table, np.median(figures["travel"][:, 0].reshape(2, 2, 3), axis=2).T)
     assert "Median over seed of the noise" in caption(drawn)
 
 
@@ -315,8 +315,8 @@ def test_the_matrix_of_models_has_every_region_and_controller(tmp_path):
     drawn = sweep.pages(data)["mismatch"]()
     panels = [ax for ax in drawn.axes if ax.get_title(loc="left").strip()]
     assert [ax.get_title(loc="left") for ax in panels] == [
-        "continuous MPC, continuous choke",
-        "mixed-integer MPC, step choke",
+        "continuous MPC, continuous actuators",
+        "mixed-integer MPC, stepped actuators",
     ]
     scaled = (figures["mean_absolute_deviation"] / (1000.0, 5.0)).mean(1).reshape(2, 2, 3, 2)
     for ax, expected in zip(panels, scaled, strict=True):
@@ -350,7 +350,7 @@ def doubled(mode, blocks, horizon, weight, seed):
 def test_regret_is_against_the_thesis_blocking_at_the_same_weight_and_seed(tmp_path):
     data = blocking_store(tmp_path / "a.zarr", cost=doubled)
     found = regret.blockings(data)
-    assert [(b.mode, b.blocks, b.horizon, b.unknowns, b.thesis) for b in found] == [
+    assert [(b.mode, b.blocks, b.horizon, b.unknowns, b.default) for b in found] == [
         ("moves", 16, 250, 32, True),
         ("moves", 3, 120, 6, False),
         ("inputs", 16, 250, 32, False),
@@ -358,7 +358,7 @@ def test_regret_is_against_the_thesis_blocking_at_the_same_weight_and_seed(tmp_p
     ]
     lost, reference = regret.regret(data, found)
     np.testing.assert_allclose(lost, np.where(data.blocks.values == THESIS_BLOCKS, 0.0, 10.0), atol=1e-9)
-    assert reference == "the thesis blocking"
+    assert reference == "the default blocking"
 
 
 def test_blocks_of_each_mv_count_their_own_moves(tmp_path):
@@ -417,14 +417,14 @@ def test_fans_are_quantiles_of_the_stored_runs_in_the_colour_of_the_controller(t
     grid_ = np.array(drawn.axes).reshape(3, 2)
     for j, colour in enumerate((style.VERMILLION, style.GREEN)):
         rows = slice(12 * j, 12 * j + 12)
-        oil = data.measurement.values[rows, :, 1]
+        gas = data.measurement.values[rows, :, 0]
         lines = {line.get_label(): line for line in grid_[0, j].lines}
-        np.testing.assert_allclose(lines["median"].get_ydata(), np.median(oil, axis=0))
+        np.testing.assert_allclose(lines["median"].get_ydata(), np.median(gas, axis=0))
         assert lines["median"].get_color() == colour
-        np.testing.assert_allclose(lines["setpoint"].get_ydata(), data.setpoint.values[0, :, 1])
+        np.testing.assert_allclose(lines["setpoint"].get_ydata(), data.setpoint.values[0, :, 0])
         assert lines["setpoint"].get_linestyle() == "--"
         wide = grid_[0, j].collections[0].get_paths()[0].vertices[:, 1]
-        low, high = np.percentile(oil, [5, 95], axis=0)
+        low, high = np.percentile(gas, [5, 95], axis=0)
         np.testing.assert_allclose([wide.min(), wide.max()], [low.min(), high.max()])
         choke = next(line for line in grid_[2, j].lines if line.get_label() == "median")
         np.testing.assert_allclose(choke.get_ydata(), np.median(data.position.values[rows, :, 0], axis=0))
@@ -446,7 +446,7 @@ def test_distributions_are_sorted_and_name_the_worst_run_with_its_command(tmp_pa
     drawn = sweep.pages(data)["distributions"]()
     first = drawn.axes[0]
     for j, colour in enumerate((style.VERMILLION, style.GREEN)):
-        travel = data.choke_travel.values[12 * j : 12 * j + 12]
+        travel = data.travel.values[12 * j : 12 * j + 12, 0]
         line = next(ln for ln in first.lines if ln.get_color() == colour and len(ln.get_xdata()) > 1)
         np.testing.assert_array_equal(line.get_xdata()[1:], np.sort(travel))
         np.testing.assert_allclose(line.get_ydata()[[0, -1]], [0, 100])
@@ -497,7 +497,7 @@ def test_one_run_is_drawn_with_its_deadzone_choke_and_lift(tmp_path):
     paths = closed_loop.draw_run(run, (1000.0, 5.0), tmp_path, "Scenario 3", kind="continuous")
     assert {path.name for path in paths} == {"run.png", "run.pdf"}
     drawn = closed_loop.run(closed_loop.of_trajectory(run, (1000.0, 0.0), "continuous", "step"), "Scenario 3")
-    oil, gas, choke, lift = drawn.axes
+    gas, oil, choke, lift = drawn.axes
     assert gas.collections
     assert not oil.collections
     lines = {line.get_label(): line for line in gas.lines}

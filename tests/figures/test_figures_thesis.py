@@ -1,10 +1,12 @@
 """All figures of the thesis: each in the registry, drawn from results alone, run only if missing, shown on one page."""
 
+import dataclasses
 import importlib
 import json
 from fractions import Fraction
 from html.parser import HTMLParser
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -19,6 +21,7 @@ from studies.store.reading import open_results
 from studies.thesis import catalogue
 from studies.thesis import integer_example as example
 from studies.thesis.integer_example import EXAMPLE, IntegerProgram, Row
+from studies.thesis.well import WELL
 from tests import studies_synthetic as made
 
 NUMBERED = [str(number) for number in (3, 4, 5, *range(10, 40))]
@@ -32,8 +35,8 @@ def quiet(line: str) -> None:
 
 def made_up(definition, controller) -> Trajectory:
     """A run of the definition's length whose choke swings by 2 % every five samples in the middle of each window."""
-    structure = controller.structure()
-    reference = definition.reference.build()
+    structure = controller.structure(WELL)
+    reference = definition.reference.build(WELL)
     setpoint = reference.sample(structure.dt)
     samples = len(setpoint)
     k = np.arange(samples)
@@ -72,20 +75,20 @@ def made_up(definition, controller) -> Trajectory:
 
 
 class Runner:
-    """Stands in for `studies.thesis.catalogue.run_named`: stores made-up runs and remembers what it was asked for."""
+    """Stands in for `studies.thesis.catalogue.run_thesis`: stores made-up runs and remembers what it was asked for."""
 
     def __init__(self):
         self.asked = []
 
     def __call__(self, name, out="results", quick=False, plant="fmu", *, progress=True, say=print, only=None):
         self.asked.append(name)
-        definition = catalogue.STUDIES[name](quick, plant)
+        definition = catalogue.comparison_of(name, quick, plant).definition
         folder = out / definition.name
         folder.mkdir(parents=True, exist_ok=True)
         names = [controller.name for controller in definition.controllers]
         code = {package: source_hash(package) for package in ("jaxmpc", "identify")}
         facts = json.dumps([name, code]), {"kind": plant}, code
-        layout = comparison_layout(definition, made.model(), made.extra, names, *facts)
+        layout = comparison_layout(definition, WELL, made.model(), made.extra, names, *facts)
         store = made.begin(folder, layout, say)
         for i in store.pending()[:only]:
             made.write(store, names[i], made_up(definition, definition.controllers[i]))
@@ -95,7 +98,7 @@ class Runner:
 @pytest.fixture
 def runner(monkeypatch):
     fake = Runner()
-    monkeypatch.setattr(catalogue, "run_named", fake)
+    monkeypatch.setattr(catalogue, "run_thesis", fake)
     monkeypatch.setitem(style.RC, "savefig.dpi", 40)
     return fake
 
@@ -106,7 +109,7 @@ def drawn(tmp_path_factory):
     folder = tmp_path_factory.mktemp("all")
     fake = Runner()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(catalogue, "run_named", fake)
+        patch.setattr(catalogue, "run_thesis", fake)
         patch.setitem(style.RC, "savefig.dpi", 40)
         paths = produce.produce(["all"], folder / "results", folder / "out", True, "jax", say=quiet)
     READ.clear()
@@ -212,7 +215,9 @@ def test_every_figure_of_the_thesis_is_in_the_registry_with_its_study_and_functi
 def test_a_figure_needs_controllers_that_its_study_has():
     for entry in registry.FIGURES.values():
         if entry.study is not None:
-            known = {one.name for one in catalogue.STUDIES[entry.study](True, "jax").controllers}
+            known = {
+                one.name for one in catalogue.comparison_of(entry.study, True, "jax").definition.controllers
+            }
             assert set(entry.needs) <= known, entry.id
 
 
@@ -300,10 +305,11 @@ def test_the_three_moves_of_an_oscillation_turn_the_choke_back_in_one_window(dra
 
 def test_events_are_marked_when_they_happen(drawn):
     data = results_of(drawn, "fine-regulation")
-    retuned = catalogue.STUDIES["fine-regulation"](True, "jax").controllers[0].then[0].at
+    retuned = catalogue.comparison_of("fine-regulation", True, "jax").definition.controllers[0].then[0].at
     assert events.retuned_at(data, "mixed-integer") == retuned == 3000.0
     pressed = results_of(drawn, "disturbance")
-    assert events.disturbed_at(pressed) == catalogue.STUDIES["disturbance"](True, "jax").disturbance[0][0]
+    course = catalogue.comparison_of("disturbance", True, "jax").definition.disturbance
+    assert events.disturbed_at(pressed) == course[0][0]
     picture = registry.FIGURES["29"].draw(data)
     for axes in picture.axes:
         (line,) = [line for line in axes.lines if line.get_linestyle() == ":"]
@@ -317,7 +323,7 @@ def test_events_are_marked_when_they_happen(drawn):
 def test_tunings_under_the_same_controller_have_their_own_colours(drawn):
     picture = soft.compared(results_of(drawn, "soft"))
     shown = {line.get_label(): line.get_color() for line in picture.axes[0].lines}
-    assert shown["nominal"] == style.TUNING_COLOURS["no-soft"]
+    assert shown["nominal"] == style.PURPLE
     assert shown["Soft MPC"] == style.CONTROLLER_COLOURS["mixed-integer", "step"]
     picture = registry.FIGURES["34"].draw(results_of(drawn, "without-soft"))
     assert shown["nominal"] in [line.get_color() for line in picture.axes[0].lines]
@@ -371,11 +377,12 @@ def test_a_study_of_other_code_or_another_definition_is_run_again(runner, tmp_pa
     with monkeypatch.context() as patch:
         patch.setattr(comparison, "source_hash", lambda package: "changed")
         assert not produce.is_current("soft", tmp_path, True, "jax")
-    longer = catalogue.STUDIES["soft"](False, "jax").reference
-    other = type(catalogue.STUDIES["soft"](True, "jax"))
-    old = catalogue.STUDIES["soft"](True, "jax")
-    changed = other(old.name, old.title, old.plant, old.controllers, longer)
-    monkeypatch.setitem(catalogue.STUDIES, "soft", lambda quick, plant: changed)
+    other = catalogue.comparison_of("soft", True, "jax")
+    longer = catalogue.comparison_of("soft", False, "jax").definition.reference
+    changed = dataclasses.replace(
+        other, definition=msgspec.structs.replace(other.definition, reference=longer)
+    )
+    monkeypatch.setattr(catalogue, "comparison_of", lambda name, quick, plant: changed)
     assert not produce.is_current("soft", tmp_path, True, "jax")
 
 
