@@ -29,7 +29,7 @@ KINDS = pytest.mark.parametrize("integer", [False, True], ids=["continuous", "mi
 @pytest.mark.parametrize("name", ["gain-scheduling", "mean-move", "time-limit"])
 def test_every_study_has_controllers_that_can_be_built(name, quick):
     definition = catalogue.comparison_of(name, quick, "jax").definition
-    definition.check()
+    definition.check(WELL)
     assert definition.name == f"{name}-{'quick-' if quick else ''}jax"
     for entry in FIGURES.values():
         if entry.study == name:
@@ -38,8 +38,10 @@ def test_every_study_has_controllers_that_can_be_built(name, quick):
 
 def test_a_schedule_changes_what_a_controller_runs_with_and_its_absence_does_not():
     plain = ControllerDefinition("a", "a", kind="continuous", actuator="step")
-    assert "schedule" not in plain.resolved()
-    assert msgspec.structs.replace(plain, schedule=True).resolved() == plain.resolved() | {"schedule": True}
+    assert "schedule" not in plain.resolved(WELL)
+    assert msgspec.structs.replace(plain, schedule=True).resolved(WELL) == plain.resolved(WELL) | {
+        "schedule": True
+    }
 
 
 # --------------------------------------------------------------------------------------------------- predictive
@@ -231,6 +233,6 @@ def test_a_grid_that_cannot_be_identified_is_refused(field, arguments):
 
 def test_the_presets_reach_the_predictive_mode_through_a_definition():
     definition = catalogue.comparison_of("mean-move", True, "jax").definition
-    modes = {c.name: c.structure().mean_move_mode for c in definition.controllers}
+    modes = {c.name: c.structure(WELL).mean_move_mode for c in definition.controllers}
     assert modes["continuous-predictive"] == modes["mixed-integer-predictive"] == "predictive"
     assert modes["continuous-reactive"] == WELL.structure().mean_move_mode == "reactive"

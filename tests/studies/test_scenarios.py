@@ -170,7 +170,7 @@ def change(at, **changes):
 )
 def test_a_scenario_that_cannot_be_run_is_refused_by_its_path(controller, field):
     with pytest.raises(InputError) as error:
-        made.definition(controllers=(scenario(**controller),)).check()
+        made.definition(controllers=(scenario(**controller),)).check(WELL)
     assert error.value.field == f"controllers.mixed-integer.{field}"
 
 
@@ -185,21 +185,21 @@ def test_a_scenario_that_cannot_be_run_is_refused_by_its_path(controller, field)
 )
 def test_a_disturbance_that_does_not_fit_is_refused_by_its_path(rows, field):
     with pytest.raises(InputError) as error:
-        made.definition(disturbance=rows).check()
+        made.definition(disturbance=rows).check(WELL)
     assert error.value.field == field
 
 
 def test_a_disturbance_holds_until_the_next():
-    offsets = made.definition(disturbance=((15.0, -3.0), (40.0, 1.0))).offsets(10.0)
+    offsets = made.definition(disturbance=((15.0, -3.0), (40.0, 1.0))).offsets(WELL)
     assert offsets[:6].tolist() == [0, 0, -3, -3, 1, 1]
-    assert not made.definition().offsets(10.0).any()
+    assert not made.definition().offsets(WELL).any()
 
 
 def test_later_tunings_build_on_the_earlier_ones():
     controller = scenario(
         changes={"bias_cutoff": 0.1}, then=(change(10.0, **GAS_OFF), change(20.0, deadzone=[1.0, 2.0]))
     )
-    (first, one), (second, two) = controller.later_tunings()
+    (first, one), (second, two) = controller.later_tunings(WELL)
     assert (first, second) == (10.0, 20.0)
     np.testing.assert_array_equal(one.cv_weight, [0.0, 0.1])
     np.testing.assert_array_equal(two.cv_weight, [0.0, 0.1])
@@ -208,15 +208,15 @@ def test_later_tunings_build_on_the_earlier_ones():
 
 
 def test_what_a_scenario_adds_is_part_of_what_identifies_a_run():
-    plain = scenario().resolved()
+    plain = scenario().resolved(WELL)
     added = [
         scenario(then=(change(10.0, **GAS_OFF),)),
         scenario(open_loop_from=10.0),
         scenario(time_limit=0.1),
         scenario(mean_move_mode="predictive"),
     ]
-    assert all(other.resolved() != plain for other in added)
-    assert scenario(name="another").resolved() == plain
+    assert all(other.resolved(WELL) != plain for other in added)
+    assert scenario(name="another").resolved(WELL) == plain
 
 
 @pytest.mark.parametrize("plant", ["fmu", "jax"])
@@ -224,7 +224,7 @@ def test_what_a_scenario_adds_is_part_of_what_identifies_a_run():
 @pytest.mark.parametrize("name", catalogue.STUDIES)
 def test_every_study_of_the_catalogue_can_be_run_and_written_down(name, quick, plant):
     study = catalogue.comparison_of(name, quick, plant).definition
-    study.check()
+    study.check(WELL)
     assert study.name == f"{name}-{'quick-' if quick else ''}{plant}"
     assert msgspec.json.decode(msgspec.json.encode(study), type=type(study)) == study
     if quick:
@@ -235,7 +235,7 @@ def test_every_study_of_the_catalogue_can_be_run_and_written_down(name, quick, p
 
 
 def test_names_that_are_not_in_the_catalogue_are_refused_before_anything_is_written(tmp_path):
-    with pytest.raises(InputError, match="one of thesis, soft"):
+    with pytest.raises(InputError, match="one of disturbance, fine-regulation"):
         catalogue.run_thesis("softly", tmp_path / "out")
     with pytest.raises(InputError, match="plant"):
         catalogue.run_thesis("soft", tmp_path / "out", plant="fmy")
@@ -274,9 +274,9 @@ def planned(model, tmp_path_factory):
 def test_a_stored_plan_predicts_what_its_controller_predicted(model, planned, i):
     study, data = planned
     one = study.controllers[i]
-    controller = Controller(one.structure(), one.build_tuning(), model)
-    theta = Planner(one.structure(), one.build_tuning(), model).matrix
-    blocks, horizon = one.structure().block_count, one.structure().prediction_horizon
+    controller = Controller(one.structure(WELL), one.build_tuning(WELL), model)
+    theta = Planner(one.structure(WELL), one.build_tuning(WELL), model).matrix
+    blocks, horizon = one.structure(WELL).block_count, one.structure(WELL).prediction_horizon
     core, unknown, nobody = controller.core, np.full(2, np.nan), np.zeros(2, dtype=bool)
     observe = jax.jit(lambda *given: core.observe(*given))
     remember = jax.jit(lambda *given: core.remember(*given))
