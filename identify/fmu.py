@@ -20,7 +20,7 @@ from identify.fmu_process import TIME_LIMIT, FmuProcess
 from jaxmpc.check import is_number
 from jaxmpc.errors import InputError, PlantError, near
 from jaxmpc.process.actuator import Actuator
-from jaxmpc.process.plant import Outputs, Parameter, checked_parameters
+from jaxmpc.process.plant import Outputs, Parameter, Signals, checked_parameters
 
 MvActuator = Actuator | tuple[float, float] | None
 
@@ -99,11 +99,12 @@ class FmuPlant:
             raise InputError("plant.settle", settle, "a number of seconds, 0 or more")
         self.path, self.dt, self.time_limit = Path(path), float(dt), time_limit
         self._stop, self._begun = stop_time, False
-        self._process = FmuProcess(path, time_limit) if description is None else None
+        self._process: FmuProcess | None = None
+        if description is None:
+            self._process = FmuProcess(path, time_limit)
+            description = self._process.description
+        self.description = description
         try:
-            known = description if self._process is None else self._process.description
-            assert known is not None
-            self.description: FmuDescription = known
             self.token, self.fmi = self.description.token, self.description.fmi
             self._check_description()
             self._substep, self._count = self.description.step_of(self.dt, substep)
@@ -202,7 +203,7 @@ class FmuPlant:
 
     def _begin(self, mv: Any, disturbance: Any, values: Mapping[str, Value] | None = None) -> None:
         """Begin a new run at time zero with these MVs and disturbances held, and more start values."""
-        if self._process is None or self._process.closed:
+        if self._process is None:
             self._process = FmuProcess(self.path, self.time_limit)
         self._position, self._begun = np.array(mv, dtype=np.float64), True
         moved = [v.nearest(x) for v, x in zip(self._mvs, self._position, strict=True)]
@@ -266,9 +267,8 @@ class FmuPlant:
 
     @property
     def _fmu(self) -> FmuProcess:
-        """The process, which says itself that it is closed."""
         if self._process is None or not self._begun:
-            raise InputError("plant", "not started", "a plant after init()")
+            raise InputError("plant", "closed", "a plant after init()")
         return self._process
 
     # -------------------------------------------------------------------------------------------------- other plants
@@ -303,6 +303,13 @@ class FmuPlant:
         start = {**(self._arguments["start"] or {}), **new}
         return FmuPlant(**(self._arguments | {"start": start, "description": self.description}))
 
+    @property
+    def signals(self) -> Signals:
+        """Names and units of its CVs, MVs and disturbances."""
+        names = self.cv_names, self.mv_names, self.disturbance_names
+        units = (tuple(self.description.variables[name].unit or "" for name in some) for some in names)
+        return Signals(self.cv_names, self.mv_names, *units)
+
     def facts(self) -> dict[str, Any]:
         """What the plant is, with a digest of everything that decides its responses."""
         how = (
@@ -315,8 +322,9 @@ class FmuPlant:
 
     def close(self) -> None:
         """Free the FMU, end its process, and remove the unpacked files; twice is once. `init` starts another."""
-        if self._process is not None:
-            self._process.close()
+        process, self._process, self._begun = self._process, None, False
+        if process is not None:
+            process.close()
 
     def __enter__(self) -> FmuPlant:
         return self

@@ -178,16 +178,18 @@ class FmuDescription:
     def step_of(self, dt: float, substep: float | None) -> tuple[float, int]:
         """The communication step [s] and how many of them make a sampling interval `dt` [s].
 
-        It is `substep`; without, the FMU's own step, or what makes a whole number of them if the FMU may vary it.
+        It is `substep`; without, that of the default experiment or the FMU's own, or the next smaller one if it may vary.
 
         Raises:
             InputError: where that is no whole number.
         """
-        own = self.fixed_step or self.experiment["step"]
-        step = substep or own or dt
-        count = max(round(dt / step), 1)
-        if abs(dt - count * step) <= 1e-9 * dt:
-            return dt / count, count
+        own = [step for step in (self.experiment["step"], self.fixed_step) if step] or [dt]
+        steps = own if substep is None else [substep]
+        for step in steps:
+            count = max(round(dt / step), 1)
+            if abs(dt - count * step) <= 1e-9 * dt:
+                return dt / count, count
+        step = steps[0]
         if substep is not None:
             raise InputError("plant.substep", substep, f"a step [s] that divides dt, {dt:g} s")
         if not self.variable_steps:

@@ -84,11 +84,6 @@ class FmuProcess:
             raise
         self._loaded = False
 
-    @property
-    def closed(self) -> bool:
-        """Whether it was closed; one whose FMU has taken its process along was not."""
-        return not self._finalizer.alive and not self._failure
-
     def load(self) -> None:
         """Load the library of the FMU and instantiate it; twice is once.
 

@@ -362,7 +362,8 @@ def main() -> None:
     channel.set_inheritable(False)  # a program that an FMU starts does not keep it open
     os.dup2(2, 1)  # what an FMU prints is no result of the command that uses it
     folder = Path(sys.argv[2])
-    threading.Thread(target=_end_with_the_parent, args=[folder], daemon=True).start()
+    watch = threading.Thread(target=_end_with_the_parent, args=[folder], daemon=True)
+    watch.start()
     with open(folder / NOTE, "r+b") as file:
         runner = Runner(folder / UNPACKED, mmap.mmap(file.fileno(), NOTE_BYTES))
     for line in channel.makefile("rb"):
@@ -371,6 +372,7 @@ def main() -> None:
         channel.sendall(json.dumps(reply).encode() + b"\n")
         if "end" in request:
             return
+    watch.join()  # the parent has gone: the files go, too
 
 
 if __name__ == "__main__":

@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 
 from identify.step_test import identify_step_response
+from identify.working_point import facts_of
 from jaxmpc.errors import InputError, near
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.actuator import Actuator
 from jaxmpc.process.file import process_digest
 from jaxmpc.process.model_plant import ModelPlant
-from jaxmpc.process.plant import Parameter, disturbances_of
+from jaxmpc.process.plant import Parameter, Signals, disturbances_of
 from jaxmpc.process.process import PlantSource, Process
 
 
@@ -82,10 +83,10 @@ def parameters_of(process: Process, name: str = "") -> tuple[Parameter, ...]:
             plant.close()
 
 
-def plant_facts(process: Process, name: str, plant: Any) -> dict[str, Any]:
+def plant_facts(process: Process, plant: Any) -> dict[str, Any]:
     """JSON-like facts that identify a plant of a process, for hashes and provenance."""
-    source = process.plants[name or next(iter(process.plants))]
-    return {"kind": source.kind, "hash": getattr(plant, "token", None) or process_digest(process)}
+    found = facts_of(plant)
+    return found if found["hash"] else found | {"hash": process_digest(process)}
 
 
 def _made(process: Process, source: PlantSource, path: str, actuators: Sequence[Actuator]) -> Any:
@@ -153,6 +154,12 @@ def load_model(process: Process, file: str = "") -> StepResponseModel:
     return model
 
 
+def signals_in(process: Process) -> Signals:
+    """Names and units of a process, as its plants say them."""
+    units = [tuple(v.unit for v in own) for own in (process.cvs, process.mvs, process.disturbances)]
+    return Signals(process.cv_names, process.mv_names, *units)
+
+
 def model_samples(process: Process) -> int:
     """Coefficients of the model of a process."""
     return load_model(process).samples if process.model.file else process.model.samples
@@ -173,12 +180,19 @@ def model_of(
     """
     if process.model.file:
         return load_model(process)
-    at = [float(v) for v in working_point] or [process.model.working_point[name] for name in process.mv_names]
-    steps = [process.model.steps[name] for name in process.mv_names]
+    at = [float(v) for v in working_point] or process.model.working_point or None
+    steps = process.model.steps or None
     own = plant is None
     plant = open_plant(process, actual=False) if own else plant
     try:
-        return identify_step_response(plant, *at, tuple(steps), samples or process.model.samples)  # type: ignore
+        return identify_step_response(
+            plant,
+            at,
+            steps,
+            samples or process.model.samples,
+            disturbance_steps=process.model.disturbance_steps,
+            signals=signals_in(process),
+        )
     finally:
         if own and hasattr(plant, "close"):
             plant.close()

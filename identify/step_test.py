@@ -1,7 +1,8 @@
 """Identification by step tests: thesis 4.1, (4.2)-(4.3).
 
 The plant is settled at a working point, each MV is stepped alone and held, and the responses are divided by
-the step. Any plant with `init`, `step` and `measure` will do: the JAX well and the FMU give the same model.
+the step. Any plant will do: a `JaxPlant` runs in compiled pieces, any other is stepped on the host
+(`identify.working_point` lists what a plant may have beyond `init` and `step`).
 """
 
 from __future__ import annotations
@@ -9,23 +10,18 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import itertools
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
-from jaxmpc.errors import InputError
+from identify.working_point import Values, check_mv, facts_of, in_order, point_of, signals_of, start
+from jaxmpc.check import is_count, is_number
+from jaxmpc.errors import InputError, near
 from jaxmpc.model.step_response import StepResponseModel, make_model
-from jaxmpc.process.well.equations import (
-    CV_NAMES,
-    CV_UNITS,
-    DEFAULT_CHOKE,
-    DEFAULT_LIFT,
-    MV_NAMES,
-    MV_UNITS,
-    well_hash,
-)
-from jaxmpc.process.well.plant import WellPlant, check_inputs
+from jaxmpc.process.plant import JaxPlant, Signals, disturbances_of
 
 SETTLE_SAMPLES = 60  # held at the working point before a step
 PIECE = 64  # samples of one call, so that all lengths are run by one program
@@ -36,7 +32,7 @@ class Settling(NamedTuple):
     """How far one response had come by the last sample.
 
     Attributes:
-        cv, mv: names.
+        cv, mv: names, of the MV or DV that was stepped.
         settled: whether it moved by less than 1 % of its largest value over the last tenth of the samples.
         movement: that movement as a share of the largest value [1].
         gain: S(N) [CV unit per MV unit].
@@ -56,8 +52,10 @@ class Settling(NamedTuple):
 def settling(model: StepResponseModel) -> list[Settling]:
     """Whether each response of a model had settled by its last sample; see `Settling`."""
     found = []
-    for (i, cv), (j, mv) in itertools.product(enumerate(model.cv_names), enumerate(model.mv_names)):
-        s = np.asarray(model.coefficients[i, j])
+    inputs = (*model.mv_names, *model.dv_names)
+    responses = np.concatenate([model.coefficients, model.dv_coefficients], axis=1)
+    for (i, cv), (j, mv) in itertools.product(enumerate(model.cv_names), enumerate(inputs)):
+        s = responses[i, j]
         gain, peak = float(s[-1]), float(s[np.argmax(np.abs(s))])
         tail = s[-max(2, len(s) // 10) :]
         movement = float(np.ptp(tail) / max(abs(peak), 1e-300)) if len(s) > 1 else 1.0
@@ -65,13 +63,6 @@ def settling(model: StepResponseModel) -> list[Settling]:
         time = (int(outside[-1]) + 2 if outside.size else 1) * model.dt
         found.append(Settling(cv, mv, movement < SETTLED_SHARE, movement, gain, peak, time))
     return found
-
-
-def identity(plant: Any) -> tuple[str, str]:
-    """What a plant is, ``jax`` or ``fmu``, and a digest of everything that decides its responses."""
-    if isinstance(plant, WellPlant):
-        return "jax", well_hash(plant.parameters)
-    return "fmu", plant.token
 
 
 def settling_notes(model: StepResponseModel) -> list[str]:
@@ -85,48 +76,57 @@ def settling_notes(model: StepResponseModel) -> list[str]:
 
 
 def apply_sequence(
-    plant: Any, choke: float, lift: float, demands: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Start a plant at a working point, choke [%] and lift [m3/h], and apply demands ``"sample 2"`` to it.
-
-    The plant is a `WellPlant`, or any on the host with ``init(choke, lift)`` and ``step(mv)``.
+    plant: Any,
+    state: Any,
+    demands: Float[np.ndarray, "sample mv"],
+    disturbances: Float[np.ndarray, "sample disturbance"],
+) -> tuple[Float[np.ndarray, "sample cv"], Float[np.ndarray, "sample mv"]]:
+    """Apply demands [MV unit] and disturbances to a plant, from the state of a `JaxPlant`; any other goes on from its own.
 
     Returns:
-        ``(cv, mv)``: measurements and applied inputs at the end of each sample, both ``"sample 2"``.
+        ``(cv, mv)``: measurements and applied inputs at the end of each sample.
     """
-    if isinstance(plant, WellPlant):
-        state, pieces = plant.init(choke, lift), []
-        held = np.pad(demands, ((0, -len(demands) % PIECE), (0, 0)), mode="edge")
+    if isinstance(plant, JaxPlant):
+        pieces = []
+        filled = ((0, -len(demands) % PIECE), (0, 0))
+        held, off = np.pad(demands, filled, mode="edge"), np.pad(disturbances, filled)
         for begin in range(0, len(held), PIECE):
-            state, outputs = _run(plant, state, held[begin : begin + PIECE])
+            own = slice(begin, begin + PIECE)
+            state, outputs = _run(plant, state, held[own], off[own])
             pieces.append((np.asarray(outputs.cv), np.asarray(outputs.mv)))
         cv, mv = (np.concatenate(parts)[: len(demands)] for parts in zip(*pieces, strict=True))
         return cv, mv
-    plant.init(choke, lift)
-    outputs = [plant.step(demand) for demand in demands]
+    outputs = [plant.step(demand, off) for demand, off in zip(demands, disturbances, strict=True)]
     return np.array([o.cv for o in outputs]), np.array([o.mv for o in outputs])
 
 
 @jax.jit
-def _run(plant, state, demands):
-    return plant.run(state, demands)
+def _run(plant, state, demands, disturbances):
+    return plant.run(state, demands, disturbances)
 
 
 def identify_step_response(
-    plant: Any = None,
-    choke: float = DEFAULT_CHOKE,
-    lift: float = DEFAULT_LIFT,
-    steps: tuple[float, float] = (2.0, 100.0),
+    plant: Any,
+    working_point: Values | None = None,
+    steps: Values | None = None,
     samples: int = 250,
+    *,
+    both_ways: bool = False,
+    disturbance_steps: Mapping[str, float] | None = None,
+    signals: Signals | None = None,
 ) -> StepResponseModel:
-    """Identify a step-response model by stepping each MV alone, (4.2)-(4.3).
+    """Identify a step-response model by stepping each MV and disturbance alone, (4.2)-(4.3).
 
     Args:
-        plant: a `WellPlant` (the default) or an `identify.well_fmu.WellFmuPlant`; its `dt` is the model's.
-        choke: position at the working point [%].
-        lift: lift rate at the working point [m3/h].
-        steps: of the choke [%] and of the lift [m3/h], not zero.
+        plant: a `JaxPlant` or a stateful one; its `dt` is the model's.
+        working_point: the MVs where the steps begin [MV unit], by name or in MV order; the plant's own by default.
+        steps: of the MVs [MV unit], by name or in MV order, not zero; the plant's `test_steps` by default.
         samples: N, the number of coefficients; S(1) is the change at the first sample after the step.
+        both_ways: whether each input is stepped in both directions and the model is the mean of both, the central difference
+            with an error of second order in the step.
+        disturbance_steps: by name, of the disturbances of the plant that are measured disturbances (DVs) of the model; not
+            zero.
+        signals: names and units; the plant's own by default.
 
     Returns:
         The model, with units, working point (MVs and settled CVs), and as provenance the kind and hash of the
@@ -134,42 +134,83 @@ def identify_step_response(
 
     Raises:
         InputError: for inputs outside their range, before anything is simulated; or if the actuator does not
-            make the step (a step choke needs at least 1.6 %, and goes to the nearest 2 % position).
+            make the step (one that moves in whole steps goes to the nearest position).
     """
-    plant = WellPlant() if plant is None else plant
-    check_inputs(choke, lift)
-    if isinstance(samples, bool) or not isinstance(samples, int) or samples < 1:
+    signals = signals_of(plant, signals)
+    point = point_of(plant, signals, working_point)
+    if not is_count(samples):
         raise InputError("samples", samples, "a whole number of 1 or more")
-    if np.shape(steps) != (2,) or not np.isfinite(steps).all() or 0.0 in tuple(steps):
-        raise InputError("steps", steps, "two finite steps that are not zero: choke [%] and lift [m3/h]")
-    check_inputs(choke + steps[0], lift + steps[1])
-
-    point = np.array([choke, lift], dtype=np.float64)
-    responses, base = [], np.zeros(2)
-    for j, step in enumerate(steps):
-        demands = np.tile(point, (SETTLE_SAMPLES + samples, 1))
-        demands[SETTLE_SAMPLES:, j] += step
-        cv, mv = apply_sequence(plant, choke, lift, demands)
-        made = mv[-1] - point
-        if abs(made[j] - step) > 1e-9 * max(1.0, abs(step)):
-            expected = f"a step that the actuator makes ({MV_NAMES[j]} moved {made[j]})"
-            raise InputError(f"steps[{j}]", step, expected)
-        base = cv[SETTLE_SAMPLES - 1]
-        responses.append((cv[SETTLE_SAMPLES:] - base).T / step)
-    kind, digest = identity(plant)
+    change = in_order("steps", getattr(plant, "test_steps", None) if steps is None else steps, signals)
+    if not change.all():
+        j = int(np.argmin(np.abs(change)))
+        raise InputError(f"steps.{signals.mv_names[j]}", 0.0, "a step that is not zero")
+    sizes = _disturbance_sizes(plant, disturbance_steps or {})
+    ways = (1.0, -1.0) if both_ways else (1.0,)
+    for way in ways:
+        check_mv(plant, point + way * change)
+    tests = [_responses(plant, signals, point, way * change, way * sizes, samples) for way in ways]
+    base = tests[0][0]
+    coefficients = tests[0][1] if len(tests) == 1 else 0.5 * (tests[0][1] + tests[1][1])
+    known, dvs = facts_of(plant), np.flatnonzero(sizes)
+    units = signals.disturbance_units
     facts = {
-        "plant": kind,
-        "plant_hash": digest,
+        "plant": known["kind"],
+        "plant_hash": known["hash"],
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "steps": [float(step) for step in steps],
+        "steps": np.concatenate([way * np.append(change, sizes[dvs]) for way in ways]).tolist(),
     }
-    found = dict(zip((*MV_NAMES, *CV_NAMES), (choke, lift, *base.tolist()), strict=True))
-    units: dict[str, Any] = {"cv_units": CV_UNITS, "mv_units": MV_UNITS}
-    coefficients = np.stack(responses, axis=1)
+    names, values = (*signals.mv_names, *signals.cv_names), (*point.tolist(), *base.tolist())
     model = make_model(
-        coefficients, plant.dt, CV_NAMES, MV_NAMES, **units, working_point=found, provenance=facts
+        coefficients[:, : len(change)],
+        plant.dt,
+        signals.cv_names,
+        signals.mv_names,
+        cv_units=signals.cv_units,
+        mv_units=signals.mv_units,
+        working_point=dict(zip(names, values, strict=True)),
+        provenance=facts,
+        dv_coefficients=coefficients[:, len(change) :],
+        dv_names=[disturbances_of(plant)[k] for k in dvs],
+        dv_units=[units[k] for k in dvs] if units else (),
     )
     notes = tuple(settling_notes(model))
     return dataclasses.replace(
         model, provenance=(*model.provenance, ("settled", not notes), ("notes", notes))
     )
+
+
+def _disturbance_sizes(plant: Any, steps: Mapping[str, float]) -> Float[np.ndarray, " disturbance"]:
+    """Step of each disturbance of the plant, 0 for those that are not stepped."""
+    names = disturbances_of(plant)
+    sizes = np.zeros(len(names))
+    for name, size in steps.items():
+        field = f"disturbance_steps.{name}"
+        if name not in names:
+            expected = f"one of the disturbances of the plant: {', '.join(names) or 'it has none'}"
+            raise InputError(field, size, expected, near(name, names))
+        if not is_number(size) or size == 0.0:
+            raise InputError(field, size, "a finite step that is not zero")
+        sizes[names.index(name)] = size
+    return sizes
+
+
+def _responses(
+    plant: Any, signals: Signals, point: np.ndarray, changes: np.ndarray, sizes: np.ndarray, samples: int
+) -> tuple[Float[np.ndarray, " cv"], Float[np.ndarray, "cv input n"]]:
+    """CVs settled at a working point, and S(1)..S(N) from a step of each MV, then of each disturbance with a size, alone."""
+    responses, base = [], np.zeros(0)
+    count, steps = len(point), np.append(changes, sizes)
+    for j in np.flatnonzero(steps):
+        state, settled = start(plant, point)
+        hold = SETTLE_SAMPLES if settled else SETTLE_SAMPLES + samples
+        inputs = np.tile(np.append(point, np.zeros_like(sizes)), (hold + samples, 1))
+        inputs[hold:, j] += steps[j]
+        cv, mv = apply_sequence(plant, state, inputs[:, :count], inputs[:, count:])
+        made = mv[-1] - point
+        if j < count and abs(made[j] - steps[j]) > 1e-9 * max(1.0, abs(steps[j])):
+            name = signals.mv_names[j]
+            expected = f"a step that the actuator makes ({name} moved {made[j]})"
+            raise InputError(f"steps.{name}", float(steps[j]), expected)
+        base = cv[hold - 1]
+        responses.append((cv[hold:] - base).T / steps[j])
+    return base, np.stack(responses, axis=1)

@@ -1,84 +1,99 @@
-"""Steady-state step coefficients over the choke range: thesis 4.1.1, figures 10 and 11.
+"""Steady-state step coefficients over the range of an MV: thesis 4.1.1, figures 10 and 11.
 
-For each lift rate, the gain of a 2 % choke step from each choke position, computed from steady states. On the
-JAX well steady states are solved in batches; on the FMU each is settled by simulation.
+For each value of a second MV, the gain of a step of the first from each of its values to the next, computed from steady
+states. A plant in JAX solves them in batches; any other settles one after the other.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
+from identify.working_point import Values, check_mv, point_of, signals_of
+from jaxmpc.check import as_floats
 from jaxmpc.errors import InputError
-from jaxmpc.process.well.equations import CV_NAMES
-from jaxmpc.process.well.plant import WellPlant, check_inputs, steady_state
+from jaxmpc.process.plant import JaxPlant, Signals
 from jaxmpc.programs.lanes import in_pieces
 
-LIFTS = (5000.0, 7500.0, 10000.0)  # m3/h, the three curves of figures 10 and 11
 POINTS = 50  # of one call, so that all grids are solved by one program
 
 
 class SteadySweep(NamedTuple):
-    """Steady states and step coefficients over choke and lift.
+    """Steady states and step coefficients over two MVs, the first and the second of the grid.
 
     Attributes:
-        choke: ``"choke"``, positions [%].
-        lift: ``"lift"``, rates [m3/h].
-        cv: ``"cv lift choke"``, steady gas and oil rates [m3/h].
-        coefficient: ``"cv lift choke-1"``, change of the steady CV from each position to the next
-            [m3/h per % choke]; entry i belongs to a step from `choke[i]`.
-        converged: ``"lift choke"``, whether the steady state was found.
-        cv_names: names of the CVs.
+        grid: by the name of each MV, its values [MV unit].
+        cv: ``"cv second first"``, steady CVs [CV unit].
+        coefficient: ``"cv second first-1"``, change of the steady CV from each value of the first MV to the next
+            [CV unit per MV unit]; entry i belongs to a step from its value i.
+        converged: ``"second first"``, whether the steady state was found.
+        signals: names and units of the plant.
     """
 
-    choke: np.ndarray
-    lift: np.ndarray
-    cv: np.ndarray
-    coefficient: np.ndarray
-    converged: np.ndarray
-    cv_names: tuple[str, ...] = CV_NAMES
-
-
-def _steady(choke, lift, parameters):
-    """Steady CVs ``"point cv"`` and whether they were found."""
-    return in_pieces(lambda *some: _some_steady(*some, parameters), POINTS, choke, lift)
+    grid: dict[str, Float[np.ndarray, " value"]]
+    cv: Float[np.ndarray, "cv second first"]
+    coefficient: Float[np.ndarray, "cv second step"]
+    converged: Bool[np.ndarray, "second first"]
+    signals: Signals
 
 
 @jax.jit
-def _some_steady(choke, lift, parameters):
-    found = jax.vmap(lambda c, q: steady_state(c, q, 0.0, parameters))(choke, lift)
+def _some_steady(plant, mv):
+    found = jax.vmap(plant.steady)(mv)
     return found.outputs.cv, found.converged
 
 
-def steady_sweep(plant: Any = None, chokes: ArrayLike | None = None, lifts: ArrayLike = LIFTS) -> SteadySweep:
-    """Steady states over a grid, and the step coefficients between neighbouring choke positions.
+def steady_sweep(
+    plant: Any,
+    grid: Mapping[str, ArrayLike],
+    *,
+    working_point: Values | None = None,
+    signals: Signals | None = None,
+) -> SteadySweep:
+    """Steady states over a grid of two MVs, and the step coefficients between neighbouring values of the first.
 
     Args:
-        plant: a `WellPlant` (the default) or an `identify.well_fmu.WellFmuPlant`.
-        chokes: increasing positions [%], two or more; by default 2, 4, ... 100 %.
-        lifts: rates [m3/h]; by default 5000, 7500 and 10000.
+        plant: one that finds its steady states: a `JaxPlant` or a stateful one with a method ``steady(mv)``.
+        grid: by MV name the values of two MVs [MV unit]: those of the first increase, two or more.
+        working_point: where the other MVs stand [MV unit]; as the plant has them by default.
+        signals: names and units; the plant's own by default.
 
     Raises:
-        InputError: for inputs outside their range or chokes that do not increase.
+        InputError: for a plant without `steady`, an unknown MV, or values outside their range or that do not increase.
     """
-    plant = WellPlant() if plant is None else plant
-    chokes = np.arange(2.0, 101.0, 2.0) if chokes is None else np.asarray(chokes, dtype=np.float64)
-    lifts = np.atleast_1d(np.asarray(lifts, dtype=np.float64))
-    check_inputs(chokes, lifts)
-    lift, choke = (grid.ravel() for grid in np.meshgrid(lifts, chokes, indexing="ij"))  # lift by lift
-    if chokes.ndim != 1 or len(chokes) < 2 or (np.diff(chokes) <= 0).any():
-        raise InputError("chokes", chokes.tolist(), "two or more increasing positions [%]")
-    if isinstance(plant, WellPlant):
-        cv, converged = _steady(choke, lift, plant.parameters)
+    signals = signals_of(plant, signals)
+    names = signals.mv_names
+    if not hasattr(plant, "steady"):
+        raise InputError(
+            "plant", type(plant).__name__, "a plant that finds its steady states (a method `steady`)"
+        )
+    if not isinstance(grid, Mapping) or len(grid) != 2 or not {*grid} <= {*names}:
+        raise InputError("grid", grid, f"the values of two of the MVs {', '.join(names)}")
+    found = {n: np.atleast_1d(as_floats(f"grid.{n}", v, "numbers [MV unit]")) for n, v in grid.items()}
+    first, second = found.values()
+    point = point_of(plant, signals, working_point)
+    check_mv(plant, [found.get(name, value) for name, value in zip(names, point, strict=True)])
+    if first.ndim != 1 or len(first) < 2 or (np.diff(first) <= 0).any():
+        unit = (signals.mv_units or ("MV unit",) * len(names))[names.index(next(iter(found)))]
+        raise InputError(
+            f"grid.{next(iter(found))}", first.tolist(), f"two or more increasing values [{unit}]"
+        )
+    mv = np.tile(point, (len(second), len(first), 1))
+    along, across = (names.index(name) for name in found)
+    mv[..., along], mv[..., across] = first, second[:, None]
+    mv = mv.reshape(-1, len(names))
+    if isinstance(plant, JaxPlant):
+        cv, converged = in_pieces(lambda some: _some_steady(plant, some), POINTS, mv)
     else:
-        settled = [
-            (plant.init(float(c), float(q)).cv, plant.settled) for c, q in zip(choke, lift, strict=True)
-        ]
-        cv, converged = zip(*settled, strict=True)
-    shape = len(lifts), len(chokes)
-    cv = np.moveaxis(np.asarray(cv).reshape(*shape, 2), -1, 0)
-    coefficient = np.diff(cv, axis=-1) / np.diff(chokes)
-    return SteadySweep(chokes, lifts, cv, coefficient, np.asarray(converged).reshape(shape))
+        settled = [plant.steady(one) for one in mv]
+        cv, converged = (
+            np.array(part) for part in zip(*((s.outputs.cv, s.converged) for s in settled), strict=True)
+        )
+    shape = len(second), len(first)
+    cv = np.moveaxis(np.asarray(cv).reshape(*shape, -1), -1, 0)
+    return SteadySweep(found, cv, np.diff(cv, axis=-1) / np.diff(first), converged.reshape(shape), signals)

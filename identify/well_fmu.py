@@ -11,6 +11,7 @@ import platform
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from identify.well_fmu_source import MODEL_IDENTIFIER, fmu_files
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
 from jaxmpc.process.actuator import Actuator
+from jaxmpc.process.plant import Signals, Steady
 from jaxmpc.process.well.choke import CHOKES, LIFT, check_choke, kind_of
 from jaxmpc.process.well.equations import (
     DEFAULT_CHOKE,
@@ -32,7 +34,7 @@ from jaxmpc.process.well.equations import (
     WellParameters,
     check_parameters,
 )
-from jaxmpc.process.well.plant import STATE_SCALE, WellOutputs, check_inputs
+from jaxmpc.process.well.plant import STATE_SCALE, WellOutputs, WellPlant, check_inputs
 from jaxmpc.programs.cache import cache_folder, read_sealed, sealed
 
 CACHE_FORMAT = 2  # of the files in the cache: sealed
@@ -97,6 +99,9 @@ class WellFmuPlant(FmuPlant):
         MissingToolError: if it has to be built and cannot.
         PlantError: as of `FmuPlant`.
     """
+
+    test_steps = WellPlant.test_steps
+    check_mv = staticmethod(WellPlant.check_mv)
 
     def __init__(
         self,
@@ -165,6 +170,20 @@ class WellFmuPlant(FmuPlant):
         return self.measure()
 
     reset = init
+
+    @property
+    def signals(self) -> Signals:
+        """Names and units as of the JAX plant."""
+        return WellPlant.signals
+
+    def facts(self) -> dict[str, Any]:
+        """What the plant is; its token is the digest of its sources."""
+        return {"kind": "fmu", "hash": self.token, "fmi": self.fmi}
+
+    def steady(self, mv, disturbance: float = 0.0) -> Steady:
+        """Start in the steady state of a choke [%] and a lift [m3/h], as `init`; the FMU keeps its state."""
+        outputs = self.init(float(mv[0]), float(mv[1]), disturbance)
+        return Steady(None, outputs, self.settled)
 
     def _settled(self) -> list[float]:
         before = self._fmu.get(STATE_NAMES)

@@ -138,7 +138,7 @@ def _path(y: np.ndarray, held: bool, low: float, high: float, width: int, height
 
 
 def named(names: Sequence[str], units: Sequence[str], k: int, kind: str) -> str:
-    """``choke [%]``; ``MV 1`` where there are no names."""
+    """``valve [%]``; ``MV 1`` where there are no names."""
     name = names[k] if k < len(names) else f"{kind} {k + 1}"
     return f"{name} [{units[k]}]" if k < len(units) and units[k] else name
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 from pathlib import Path
+from typing import Any
 
 from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, PLANTS, Options, choice, command, option
 from jaxmpc.errors import InputError
@@ -52,15 +53,16 @@ def identify(options: Options) -> int:
     """Identify a step-response model: settle the plant and step each MV alone."""
     check_target("--out", options.out)
     from identify.step_test import identify_step_response, settling_notes
+    from jaxmpc.process.well.plant import WellPlant
 
     with contextlib.ExitStack() as stack:
-        plant = None  # the JAX well
+        plant: Any = WellPlant()
         if options.plant == "fmu":
             from identify.well_fmu import WellFmuPlant
 
             plant = stack.enter_context(WellFmuPlant())
-        start = options.choke, options.lift
-        model = identify_step_response(plant, *start, tuple(options.steps), options.samples)
+        start = {"choke": options.choke, "gas_lift": options.lift}
+        model = identify_step_response(plant, start, options.steps, options.samples)
     for note in settling_notes(model):
         print(f"jaxmpc: {note}", file=sys.stderr)
     print(model.save(options.out))

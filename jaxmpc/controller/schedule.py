@@ -1,8 +1,8 @@
 """Gain scheduling (thesis chapter 8): step-response models over a grid of working points, and controllers that use them.
 
-The choke of a gas-lifted well does several times more near closed than at half open. A schedule interpolates between models
-that were identified at several positions; every sample, the controllers here predict their future moves with the model of
-the present MVs.
+A valve does several times more near closed than at half open. A schedule interpolates between models that were identified at
+several values of one or two MVs; every sample, the controllers here predict their future moves with the model of the present
+MVs.
 
 A change of model is bumpless. What past moves will still do stays in the shift register as it was
 predicted when they were made; only the response of moves from now on changes. What the prediction then misses is
@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import itertools
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxmpc.check import check_keys, is_count, is_number
+from jaxmpc.check import LARGEST, check_keys, is_count, is_number
 from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.controller.core import ControllerState, Core, Moment, StepInfo
 from jaxmpc.controller.sample import Sample
@@ -42,33 +43,42 @@ from jaxmpc.programs.clock import Clock
 from jaxmpc.programs.lanes import Lanes
 
 FORMAT = "jaxmpc/gain-schedule/1"
-SPACING = 250.0  # of continuous MVs in the table of mixed-integer controllers [MV unit]
+FINER = 10  # times finer than the grid of a schedule is the table of mixed-integer controllers
 KEPT = 32  # mixed-integer controllers kept, 2.5 MB each at thesis size
 
 
 class ModelSchedule(eqx.Module):
-    """Step-response models over a grid of two MVs.
+    """Step-response models over a grid of one or two MVs.
 
     Attributes:
-        choke: ``"choke"``, positions of the first MV, increasing [%].
-        lift: ``"lift"``, values of the second MV, increasing [m3/h].
-        coefficients: ``"choke lift cv mv n"``, S(1)..S(N) at each of them [CV unit per MV unit].
+        grid: ``"value"`` per scheduling MV, increasing [MV unit].
+        coefficients: ``"cv mv n"`` after one axis per scheduling MV, S(1)..S(N) at each of them [CV unit per MV unit].
         reference: a model with the names, units and dt of all; its coefficients are those of the middle of the grid.
+        scheduled: names of the scheduling MVs.
     """
 
-    choke: Float[Array, " choke"]
-    lift: Float[Array, " lift"]
-    coefficients: Float[Array, "choke lift cv mv n"]
+    grid: tuple[Float[Array, " value"], ...]
+    coefficients: Float[Array, "*value cv mv n"]
     reference: StepResponseModel
+    scheduled: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def places(self) -> list[int]:
+        """Which of the MVs of the models the scheduling ones are."""
+        return [self.reference.mv_names.index(name) for name in self.scheduled]
 
     def coefficients_at(self, mv: Float[Array, " mv"]) -> Float[Array, "cv mv n"]:
-        """S(1)..S(N) at the MVs [MV unit], bilinear; beyond the grid those of its border. Pure: jit it, vmap it."""
-        i, next_i, along_choke = _cell(self.choke, mv[0])
-        j, next_j, along_lift = _cell(self.lift, mv[1])
-        s = self.coefficients
-        low = s[i, j] + along_lift * (s[i, next_j] - s[i, j])  # equal models give exactly that model
-        high = s[next_i, j] + along_lift * (s[next_i, next_j] - s[next_i, j])
-        return low + along_choke * (high - low)
+        """S(1)..S(N) at the MVs [MV unit], linear in each; beyond the grid those of its border. Pure: jit it, vmap it."""
+        cells = [_cell(values, mv[k]) for values, k in zip(self.grid, self.places, strict=True)]
+
+        def between(*points):
+            if len(points) == len(cells):
+                return self.coefficients[points]
+            i, next_i, along = cells[len(points)]
+            low = between(*points, i)
+            return low + along * (between(*points, next_i) - low)  # equal models give exactly that model
+
+        return between()
 
     def model_at(self, mv) -> StepResponseModel:
         """The model at the MVs [MV unit], as `coefficients_at`."""
@@ -93,7 +103,7 @@ class ModelSchedule(eqx.Module):
             "provenance": dict(model.provenance),
             "grid": {
                 name: np.asarray(values).tolist()
-                for name, values in zip(model.mv_names, (self.choke, self.lift), strict=True)
+                for name, values in zip(self.scheduled, self.grid, strict=True)
             },
             "coefficients": np.asarray(self.coefficients).tolist(),
         }
@@ -110,39 +120,47 @@ class ModelSchedule(eqx.Module):
             expected = "an object with dt, cv, mv, grid and coefficients"
             raise InputError("schedule", type(body).__name__, expected)
         check_keys("schedule", body, ("dt", "cv", "mv", "grid", "coefficients"))
-        names, grid = body["mv"], body["grid"]
-        if not isinstance(grid, dict) or sorted(grid) != sorted(names):
-            raise InputError("schedule.grid", grid, f"one list of values for each of {names}")
-        axes = [grid[name] for name in names]
-        rows = body["coefficients"]
-        if len(rows) != len(axes[0]) or any(len(row) != len(axes[1]) for row in rows):
+        grid, path = body["grid"], "schedule.coefficients"
+        scheduled = [name for name in body["mv"] if isinstance(grid, dict) and name in grid]
+        if not scheduled or len(scheduled) != len(grid):
             raise InputError(
-                "schedule.coefficients", f"{len(rows)} rows", f"{len(axes[0])} rows of {len(axes[1])} models"
+                "schedule.grid", grid, f"a list of values for each of one or two of {body['mv']}"
             )
+        places: list[tuple[str, Any]] = [("", body["coefficients"])]
+        for name in scheduled:
+            for where, some in places:
+                if not isinstance(some, list) or len(some) != len(grid[name]):
+                    given = f"{len(some)} entries" if isinstance(some, list) else some
+                    raise InputError(
+                        path + where, given, f"{len(grid[name])} entries, one per value of {name}"
+                    )
+            places = [(f"{where}[{i}]", one) for where, some in places for i, one in enumerate(some)]
+        points = itertools.product(*(grid[name] for name in scheduled))
         return make_schedule(
             [
                 make_model(
-                    rows[i][j],
+                    coefficients,
                     body["dt"],
                     body["cv"],
-                    names,
+                    body["mv"],
                     cv_units=body.get("cv_units", ()),
                     mv_units=body.get("mv_units", ()),
-                    working_point={names[0]: first, names[1]: second},
+                    working_point=dict(zip(scheduled, point, strict=True)),
                     provenance=body.get("provenance", {}),
-                    path=f"schedule.coefficients[{i}][{j}]",
+                    path=path + where,
                 )
-                for i, first in enumerate(axes[0])
-                for j, second in enumerate(axes[1])
-            ]
+                for (where, coefficients), point in zip(places, points, strict=True)
+            ],
+            scheduled,
         )
 
 
-def make_schedule(models: Sequence[StepResponseModel]) -> ModelSchedule:
+def make_schedule(models: Sequence[StepResponseModel], scheduled: Sequence[str] = ()) -> ModelSchedule:
     """Checked constructor from models whose working points form a grid.
 
     Args:
-        models: one per working point, in any order; of the same names, dt and number of coefficients, two MVs.
+        models: one per working point, in any order; of the same names, dt and number of coefficients.
+        scheduled: names of the one or two MVs that are the axes of the grid; by default all MVs of the models.
 
     Raises:
         InputError: naming the model that does not fit, or the working point that is missing or there twice.
@@ -150,9 +168,11 @@ def make_schedule(models: Sequence[StepResponseModel]) -> ModelSchedule:
     if not models:
         raise InputError("models", "nothing", "one or more, one per working point")
     first = models[0]
-    if len(first.mv_names) != 2:
-        raise InputError("models[0].mv", list(first.mv_names), "two MVs, the axes of the grid")
-    points: dict[tuple[float, float], StepResponseModel] = {}
+    names = tuple(scheduled) or first.mv_names
+    if len(set(names)) not in (1, 2) or len(set(names)) < len(names) or not {*names} <= {*first.mv_names}:
+        expected = f"one or two of {', '.join(first.mv_names)}, the axes of the grid"
+        raise InputError("scheduled", list(names), expected)
+    points: dict[tuple[float, ...], StepResponseModel] = {}
     for k, model in enumerate(models):
         for key in ("cv_names", "mv_names", "cv_units", "mv_units", "dt", "samples"):
             if getattr(model, key) != getattr(first, key):
@@ -164,26 +184,26 @@ def make_schedule(models: Sequence[StepResponseModel]) -> ModelSchedule:
                 f"models[{k}].dv", list(model.dv_names), "none: a schedule has no measured disturbances"
             )
         where = dict(model.working_point)
-        missing = [name for name in model.mv_names if not np.isfinite(where.get(name, np.nan))]
-        if missing:
-            raise InputError(
-                f"models[{k}].working_point.{missing[0]}", where.get(missing[0]), "a finite value [MV unit]"
-            )
-        point = (where[model.mv_names[0]], where[model.mv_names[1]])
+        for name in names:
+            if not np.isfinite(where.get(name, np.nan)):
+                raise InputError(
+                    f"models[{k}].working_point.{name}", where.get(name), "a finite value [MV unit]"
+                )
+        point = tuple(where[name] for name in names)
         if point in points:
             raise InputError(f"models[{k}].working_point", point, "a working point that no other model has")
         points[point] = model
-    axes = [sorted({point[axis] for point in points}) for axis in (0, 1)]
-    for point in [(a, b) for a in axes[0] for b in axes[1]]:
+    grid = [sorted(set(values)) for values in zip(*points, strict=True)]
+    for point in itertools.product(*grid):
         if point not in points:
             raise InputError("models", f"none at {point}", "a model at every point of the grid")
-    middle = points[axes[0][len(axes[0]) // 2], axes[1][len(axes[1]) // 2]]
-    coefficients = [[points[a, b].coefficients for b in axes[1]] for a in axes[0]]
+    middle = points[tuple(values[len(values) // 2] for values in grid)]
+    coefficients = jnp.stack([points[point].coefficients for point in itertools.product(*grid)])
     return ModelSchedule(
-        choke=jnp.asarray(axes[0]),
-        lift=jnp.asarray(axes[1]),
-        coefficients=jnp.stack([jnp.stack(row) for row in coefficients]),
+        grid=tuple(jnp.asarray(values) for values in grid),
+        coefficients=coefficients.reshape(*map(len, grid), *coefficients.shape[1:]),
         reference=middle,
+        scheduled=names,
     )
 
 
@@ -194,6 +214,13 @@ def _cell(grid: Float[Array, " point"], value):
         return 0, 0, 0.0
     i = jnp.clip(jnp.searchsorted(grid, value, side="right") - 1, 0, last - 1)
     return i, i + 1, jnp.clip((value - grid[i]) / (grid[i + 1] - grid[i]), 0.0, 1.0)
+
+
+def _apart(asked: float | None, values: Float[Array, " value"]) -> float:
+    """Distance of the table's controllers along an MV of a schedule [MV unit]."""
+    if len(values) == 1:  # the same model everywhere
+        return LARGEST
+    return asked or float(np.diff(np.asarray(values)).min()) / FINER
 
 
 def _register(schedule: ModelSchedule, mv, samples: int) -> Float[Array, "cv mv future"]:
@@ -238,19 +265,21 @@ class _Table:
     """Controllers with whole moves over the present MVs, made when first needed; steps like `Controllers` of one lane.
 
     Args:
-        spacing: of the table in continuous MVs [MV unit]; integer MVs have one row per step.
+        spacing: of the table in continuous scheduling MVs [MV unit]; integer MVs have one row per step.
         kept: controllers kept; the one used least recently goes first.
     """
 
-    def __init__(self, controllers: Controllers, schedule: ModelSchedule, spacing: float, kept: int):
-        if not is_number(spacing) or spacing <= 0:
+    def __init__(self, controllers: Controllers, schedule: ModelSchedule, spacing: float | None, kept: int):
+        if spacing is not None and not (is_number(spacing) and spacing > 0):
             raise InputError("spacing", spacing, "a positive distance of models in the table [MV unit]")
         if not is_count(kept):
             raise InputError("kept", kept, "a whole number of controllers, 1 or more")
         self.reference, self.schedule, self.spacing, self.kept = controllers, schedule, spacing, kept
         self.size, self.init, self.structure = controllers.size, controllers.init, controllers.structure
         self.scenarios, self.dv_names, self.count = controllers.scenarios, controllers.dv_names, 1
-        self.grid = np.array([step or spacing for step in self.structure.steps])
+        steps = (self.structure.steps[k] for k in schedule.places)
+        apart = [_apart(step or spacing, v) for step, v in zip(steps, schedule.grid, strict=True)]
+        self.places, self.grid = schedule.places, np.array(apart)
         self.built = 0  # controllers made so far
         self._table: collections.OrderedDict[tuple[float, ...], Controllers] = collections.OrderedDict()
 
@@ -260,9 +289,11 @@ class _Table:
 
     def at(self, mv) -> Controllers:
         """The controller for the MVs [MV unit], rounded to the table."""
-        point = tuple((np.round(np.asarray(mv) / self.grid) * self.grid).tolist())
+        rounded = np.array(mv, dtype=np.float64)
+        rounded[self.places] = np.round(rounded[self.places] / self.grid) * self.grid
+        point = tuple(rounded[self.places].tolist())
         if point not in self._table:
-            own, model = self.reference, self.schedule.model_at(point)
+            own, model = self.reference, self.schedule.model_at(rounded)
             options: dict[str, Any] = dict(gap=own.gap, time_limit=own.time_limit, finish=own.finish)
             self._table[point] = Controllers(self.structure, own.scenarios.tunings, model, **options)
             self.built += 1
@@ -294,7 +325,7 @@ class ScheduledController(Controller):
     table of controllers over the present MVs is kept.
 
     Args:
-        spacing: of the table in continuous MVs [MV unit].
+        spacing: of the table in continuous scheduling MVs [MV unit]; a tenth of the schedule's own by default.
         kept: controllers kept in the table.
         **options: ``gap``, ``time_limit`` and ``finish`` of `Controller`.
     """
@@ -305,7 +336,7 @@ class ScheduledController(Controller):
         tuning: Tuning,
         schedule: ModelSchedule,
         *,
-        spacing: float = SPACING,
+        spacing: float | None = None,
         kept: int = KEPT,
         **options: Any,
     ):

@@ -35,7 +35,7 @@ def augment(
     model: StepResponseModel,
     target_weight: Mapping[str, float],
 ) -> tuple[Structure, Tuning, StepResponseModel]:
-    """The controller's problem with one more CV per MV that has a target, named ``choke.target`` and the like.
+    """The controller's problem with one more CV per MV that has a target, named ``valve.target`` and the like.
 
     Every sample j = first_penalised..Hp pays weight * (u(k+j-1) - target)^2; beyond the control horizon u is held, so that
     its last value counts Hp - Hu + 1 times.

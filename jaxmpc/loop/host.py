@@ -55,7 +55,7 @@ def simulate_on_host(
     controller, state = takeovers[0], states[0]
     records: list[dict[str, Any]] = []
     carried = None
-    with _undisturbed():
+    with undisturbed():
         for k in range(total):
             cv = np.asarray(outputs.cv) + errors[k]
             if k in takeovers:
@@ -95,7 +95,7 @@ def recorded(cv: np.ndarray, state: ControllerState, info: StepInfo) -> dict[str
 
 
 @contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
+def undisturbed() -> Iterator[None]:
     """No search for garbage among what is there already: compiled programs would keep it busy for a fifth of a second."""
     if gc.get_freeze_count():  # the caller's business
         yield

@@ -19,7 +19,7 @@ from jaxmpc.controller.measurement import MISSING, received
 from jaxmpc.controller.sample import Sample
 from jaxmpc.errors import PlantError
 from jaxmpc.loop.compiled import Inputs
-from jaxmpc.loop.host import recorded
+from jaxmpc.loop.host import recorded, undisturbed
 from jaxmpc.process.plant import StatefulPlant
 from jaxmpc.programs.compilation import compiling_for
 from jaxmpc.programs.threads import parts_of, side_by_side
@@ -48,7 +48,7 @@ def simulate_host_lanes(
     """
     lock, count, failures = threading.Lock(), len(plants), {}
     parts = parts_of(count, TOGETHER, cut=True)
-    runs = [_Run(controllers.part(part), Inputs(*(v[part] for v in inputs))) for part in parts]
+    runs = [_Run(controllers.part(part), inputs.part(part)) for part in parts]
     with compiling_for(f"loops of {controllers.size}"):
         runs[0].compile()
 
@@ -65,7 +65,8 @@ def simulate_host_lanes(
         failures.update({first + lane: error for lane, error in failed.items()})
         return {name: values[: len(own)] for name, values in fields.items()}
 
-    found = side_by_side(advance, range(len(parts)))
+    with undisturbed():
+        found = side_by_side(advance, range(len(parts)))
     fields = {name: np.concatenate([part.pop(name) for part in found]) for name in list(found[0])}
     return fields, dict(sorted(failures.items()))
 
@@ -83,7 +84,7 @@ class _Run:
 
     def compile(self) -> None:
         """Before the clock starts."""
-        self._decide(self.controllers.init(self.cv, self.mv), self.cv, self.inputs.setpoints[:, 0])
+        self._decide(self.controllers.init(self.cv, self.mv), self.cv, 0)
 
     def advanced(
         self, plants: Sequence[Any], tick: Callable[[int], None], stopped: Callable[[], bool]
@@ -100,14 +101,14 @@ class _Run:
         return {name: np.stack([r[name] for r in records], axis=1) for name in records[0]}, self.failed
 
     def _samples(self, plants, tick, stopped) -> list[dict[str, np.ndarray]]:
-        setpoints, offsets, errors, faults = self.inputs[:4]
+        _, offsets, errors, faults, *_ = self.inputs
         state, records = self.controllers.init(self.cv, self.mv), []
         named = [hasattr(plant, "disturbance_names") for plant in plants]
-        for k in range(setpoints.shape[1]):
+        for k in range(errors.shape[1]):
             measured = self.alive.copy()
             cv = np.where(measured[:, None], self.cv + errors[:, k], np.nan)
             arrived = received(cv, faults[:, k], np.asarray(state.sensors.value))
-            state, info = self._decide(state, arrived, setpoints[:, k])
+            state, info = self._decide(state, arrived, k)
             record = recorded(cv, state, info)
             demand = record["mv_demand"]
 
@@ -123,10 +124,15 @@ class _Run:
                 break
         return records
 
-    def _decide(self, state, arrived: np.ndarray, setpoint: np.ndarray):
+    def _decide(self, state, arrived: np.ndarray, k: int):
+        """What is done at sample k; beyond the end of the run setpoints and disturbances stay as they are."""
         gone = np.repeat(~self.alive[:, None], self.mv.shape[1], axis=1)
         stands = np.where(self.inputs.told[:, None] | gone, self.mv, np.nan)
-        return self.controllers.decide(state, Sample(arrived, setpoint, stands, gone))
+        total, ahead = self.inputs.setpoints.shape[1], self.inputs.preview
+        rows = np.minimum(k + np.arange(self.controllers.size.future if ahead else 1), total - 1)
+        setpoint = self.inputs.setpoints[:, np.minimum(rows + ahead, total - 1)]
+        dv = self.inputs.dv[:, rows] if self.inputs.dv.size else None
+        return self.controllers.decide(state, Sample(arrived, setpoint, stands, gone, dv))
 
     def _each(self, plants: Sequence[Any], act: Callable[[int, Any], Any]) -> None:
         """Do something with the plant of every lane that has one, and keep what it measures."""

@@ -26,7 +26,7 @@ class Trajectory:
         setpoint: ``"sample cv"`` [CV unit].
         cv: ``"sample cv"``, measured at `time` by sensors without fault, noise included [CV unit].
         mv_demand: ``"sample mv"``, demand of the controller, held from `time` [MV unit].
-        mv: ``"sample mv"``, what the actuators did with it, the step-choke logic included [MV unit].
+        mv: ``"sample mv"``, what the actuators did with it, steps and limits included [MV unit].
         move: ``"sample mv"``, demand minus previous demand [MV unit].
         bias: ``"sample cv"``, filtered output bias v(k|k) (6.4) [CV unit].
         bias_raw: ``"sample cv"``, measured minus predicted output (2.31b) [CV unit].

@@ -37,7 +37,7 @@ class StepResponseModel(eqx.Module):
         dt: sampling interval [s].
         cv_names, mv_names: names in the order of the arrays.
         cv_units, mv_units: engineering units in the same order.
-        working_point: ``(("choke", 50.0), ...)``: MV values (and settled CV values) the steps started from.
+        working_point: ``(("valve", 50.0), ...)``: MV values (and settled CV values) the steps started from.
         provenance: further facts, for example plant hash, dates, whether a response had settled.
         dv_coefficients: ``"cv dv n"``, as `coefficients`, of the DVs [CV unit per DV unit]; of none if not given.
         dv_names, dv_units: of the DVs.

@@ -102,7 +102,7 @@ class Tuning(eqx.Module):
     demand_lead: Float[Array, " mv"] = _mv_kept(
         "MV unit",
         "how far the demand may lead the position of {}",
-        "where that is told; 0 starts every move from there, a step choke that is asked in small moves needs a step",
+        "where that is told; 0 starts every move from there, a stepped actuator that is asked in small moves needs a step",
         default=0.0,
     )
 

@@ -84,6 +84,8 @@ class ModelSection(Section, frozen=True):
     file: str = ""
     working_point: Numbers = {}
     steps: Numbers = {}
+    disturbance_steps: Numbers = {}
+    schedule: dict[str, tuple[float, ...]] = {}
     samples: Annotated[int, msgspec.Meta(ge=1)] = 250
 
 
@@ -179,7 +181,7 @@ def process_of(body: Any, folder: str | Path = ".", *, files: bool = True) -> Pr
         mvs=mvs,
         disturbances=tuple(Variable(s.name, s.unit, _label(s), s.span) for s in file.disturbance),
         plants={name: PlantSource(s.kind, s.source, dict(s.options)) for name, s in file.plants.items()},
-        model=ModelSource(file.model.file, file.model.working_point, file.model.steps, file.model.samples),
+        model=ModelSource(**msgspec.structs.asdict(file.model)),
         structure_fields=_structure_fields(file.structure),
         presets={name: _preset(file.presets, name) for name in file.presets},
         references={
@@ -262,11 +264,16 @@ def _check_names(file: ProcessFile) -> None:
         _require(
             section.integral_of in channels, f"key_figure[{i}].integral_of", section.integral_of, expected
         )
-    mvs = [s.name for s in file.mv]
-    for table in ("working_point", "steps"):
+    mvs, disturbances = [s.name for s in file.mv], [s.name for s in file.disturbance]
+    for name, values in file.model.schedule.items():
+        _require(
+            name in mvs, f"model.schedule.{name}", values, f"one of the MVs {', '.join(mvs)}", near(name, mvs)
+        )
+    for table in ("working_point", "steps", "disturbance_steps"):
+        known = disturbances if table == "disturbance_steps" else mvs
         for name, value in getattr(file.model, table).items():
             path = f"model.{table}.{name}"
-            _require(name in mvs, path, value, f"one of the MVs {', '.join(mvs)}", near(name, mvs))
+            _require(name in known, path, value, f"one of {', '.join(known)}", near(name, known))
             good = is_number(value) and (table == "working_point" or value != 0)
             _require(
                 good,

@@ -19,7 +19,7 @@ from jaxmpc.check import is_number
 from jaxmpc.errors import InputError, near
 from jaxmpc.model.step_response import StepResponseModel, shift_free_response
 from jaxmpc.process.actuator import Actuator, Actuators
-from jaxmpc.process.plant import JaxPlant, Outputs, Parameter, checked_parameters
+from jaxmpc.process.plant import JaxPlant, Outputs, Parameter, Signals, checked_parameters
 
 NOTHING = 1e-9  # of the largest value of a response: what counts as no response yet
 LONGEST = 20_000  # samples of a response
@@ -67,6 +67,7 @@ class ModelPlant(JaxPlant):
     dt: float = eqx.field(static=True)
     cv_names: tuple[str, ...] = eqx.field(static=True)
     mv_names: tuple[str, ...] = eqx.field(static=True)
+    signals: Signals = eqx.field(static=True)
     dv_names: tuple[str, ...] = eqx.field(static=True)
     actuators: Actuators = eqx.field(static=True)
 
@@ -78,8 +79,11 @@ class ModelPlant(JaxPlant):
     ):
         self.dt, self.cv_names, self.mv_names = model.dt, model.cv_names, model.mv_names
         self.dv_names = model.dv_names
-        tables = np.asarray(model.coefficients), np.asarray(model.dv_coefficients)
-        self.nominal = self.coefficients = np.concatenate(tables, axis=1)
+        tables = model.coefficients, model.dv_coefficients
+        self.nominal = self.coefficients = np.concatenate([np.asarray(table) for table in tables], axis=1)
+        loads = model.cv_units or ("",) * len(model.cv_names)
+        units = (*(model.dv_units or ("",) * len(model.dv_names)), *loads)
+        self.signals = Signals(model.cv_names, model.mv_names, model.cv_units, model.mv_units, units)
         self.common = np.array([knob.default for knob in KNOBS])
         self.pairs = np.tile(self.common[:, None, None], self.nominal.shape[:2])
         self.actuators = Actuators.of(actuators, len(self.mv_names))

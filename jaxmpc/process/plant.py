@@ -29,6 +29,24 @@ class Outputs(NamedTuple):
     mv: Any  # ``"mv"``, where the actuators stand [MV unit]
 
 
+class Signals(NamedTuple):
+    """Names and units of what goes into and out of a plant, in the order of its vectors; units may be left out."""
+
+    cv_names: tuple[str, ...]
+    mv_names: tuple[str, ...]
+    cv_units: tuple[str, ...] = ()
+    mv_units: tuple[str, ...] = ()
+    disturbance_units: tuple[str, ...] = ()  # in the order of the plant's `disturbance_names`
+
+
+class Steady(NamedTuple):
+    """A steady state of a plant with held MVs."""
+
+    state: Any  # of a `JaxPlant`; None where the plant keeps its own, and stands there then
+    outputs: Any  # what it measures there, as `Outputs`
+    converged: Any  # whether it is one; else the last state on the way to it
+
+
 class PlantOutputs(Protocol):
     """What a plant measures at the end of a sample; more than `Outputs` is allowed."""
 

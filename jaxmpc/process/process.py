@@ -82,6 +82,11 @@ class ModelSource:
         default_factory=dict
     )  # of the step test, by MV [MV unit]
     steps: dict[str, float] = dataclasses.field(default_factory=dict)  # sizes of its steps, by MV [MV unit]
+    disturbance_steps: dict[str, float] = dataclasses.field(
+        default_factory=dict
+    )  # of measured disturbances, by name
+    # positions of one or two MVs at which the models of a gain schedule are identified [MV unit]
+    schedule: dict[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
     samples: int = 250  # coefficients
 
 

@@ -1,4 +1,4 @@
-"""Steady states over choke and lift, (6.19b): the map that the real-time optimisation of thesis 6.7 works on.
+"""Steady states over two MVs, (6.19b): the map that the real-time optimisation of thesis 6.7 works on.
 
 `identify.steady_map` makes one of a plant, `optimise` optimises over it. Between its grid points it is linear over
 triangles.
@@ -7,6 +7,7 @@ triangles.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,59 +20,51 @@ from jaxmpc.check import as_floats, check_keys
 from jaxmpc.errors import InputError
 from jaxmpc.files import read_json, write_atomically
 
-FORMAT = "jaxmpc/steady-map/1"
+FORMAT, OLD_FORMAT = "jaxmpc/steady-map/2", "jaxmpc/steady-map/1"
+OLD_KEYS = ("format", "cv", "mv", "cv_units", "mv_units", "provenance", "values")
 INSIDE = 1e-9  # barycentric coordinate down to which a point belongs to a triangle
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SteadyMap:
-    """Steady CVs over choke and lift, (6.19b); checked on construction.
+    """Steady CVs over two MVs, (6.19b); checked on construction.
 
     Attributes:
-        choke: ``"choke"``, increasing positions [%].
-        lift: ``"lift"``, increasing rates [m3/h].
-        cv: ``"cv lift choke"`` [CV unit], NaN where there is no steady state. A triangle with such a corner is left out.
+        grid: by the name of each MV, its increasing values [MV unit].
+        cv: ``"cv second first"`` [CV unit], over the second and the first MV of the grid; NaN where there is no steady
+            state. A triangle with such a corner is left out.
         cv_names, cv_units: of the CVs.
-        mv_names, mv_units: of choke and lift.
+        mv_units: of the MVs.
         provenance: JSON-like facts on where the numbers come from.
 
     Raises:
         InputError: naming the field, for wrong shapes, grids that do not increase, infinite values or no triangle at all.
     """
 
-    choke: Float[np.ndarray, " choke"]
-    lift: Float[np.ndarray, " lift"]
-    cv: Float[np.ndarray, "cv lift choke"]
+    grid: Mapping[str, Float[np.ndarray, " value"]]
+    cv: Float[np.ndarray, "cv second first"]
     cv_names: tuple[str, ...]
-    mv_names: tuple[str, str] = ("choke", "gas_lift")
     cv_units: tuple[str, ...] = ()
-    mv_units: tuple[str, str] = ("%", "m3/h")
+    mv_units: tuple[str, ...] = ()
     provenance: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
-        for key, unit in (("choke", "%"), ("lift", "m3/h")):
-            grid = as_floats(f"map.{key}", getattr(self, key), f"two or more increasing values [{unit}]")
-            if grid.ndim != 1 or len(grid) < 2 or not np.isfinite(grid).all() or (np.diff(grid) <= 0).any():
-                raise InputError(f"map.{key}", grid.tolist(), f"two or more increasing values [{unit}]")
-            object.__setattr__(self, key, grid)
         object.__setattr__(self, "cv_names", tuple(self.cv_names))
-        object.__setattr__(self, "mv_names", tuple(self.mv_names))
         object.__setattr__(self, "cv_units", tuple(self.cv_units) or ("",) * len(self.cv_names))
-        object.__setattr__(self, "mv_units", tuple(self.mv_units))
+        object.__setattr__(self, "mv_units", tuple(self.mv_units) or ("", ""))
+        object.__setattr__(self, "grid", _checked(self.grid, self.mv_units))
         names = (*self.cv_names, *self.mv_names)
-        if not self.cv_names or len(self.mv_names) != 2 or len(set(names)) != len(names):
-            raise InputError(
-                "map.cv, map.mv", list(names), "distinct names: one or more CVs, then choke and lift"
-            )
-        for key, count in (("cv_units", len(self.cv_names)), ("mv_units", 2)):
-            if len(getattr(self, key)) != count:
-                raise InputError(f"map.{key}", list(getattr(self, key)), f"{count} units, one per name")
-        shape = (len(self.cv_names), len(self.lift), len(self.choke))
-        cv = as_floats("map.cv", self.cv, f"numbers of shape {list(shape)}, CV by lift by choke")
+        if not self.cv_names or len(set(names)) != len(names):
+            raise InputError("map.cv, map.grid", list(names), "distinct names: one or more CVs, then two MVs")
+        for key, of in (("cv_units", self.cv_names), ("mv_units", self.mv_names)):
+            if len(getattr(self, key)) != len(of):
+                raise InputError(f"map.{key}", list(getattr(self, key)), f"{len(of)} units, one per name")
+        first, second = self.grid.values()
+        shape = (len(self.cv_names), len(second), len(first))
+        expected = f"numbers of shape {list(shape)}, CV by {' by '.join(reversed(self.mv_names))}"
+        cv = as_floats("map.cv", self.cv, expected)
         if cv.shape != shape or np.isinf(cv).any():
-            raise InputError(
-                "map.cv", f"shape {list(cv.shape)}", f"numbers of shape {list(shape)}, none infinite"
-            )
+            raise InputError("map.cv", f"shape {list(cv.shape)}", f"{expected}, none infinite")
         object.__setattr__(self, "cv", cv)
         if not len(self.triangles):
             raise InputError(
@@ -79,10 +72,15 @@ class SteadyMap:
             )
 
     @property
+    def mv_names(self) -> tuple[str, ...]:
+        """The two MVs of the grid."""
+        return tuple(self.grid)
+
+    @property
     def points(self) -> Float[np.ndarray, "point 2"]:
-        """Choke [%] and lift [m3/h] of the grid points, choke fastest."""
-        choke, lift = np.meshgrid(self.choke, self.lift)
-        return np.stack([choke.ravel(), lift.ravel()], axis=1)
+        """MVs of the grid points [MV unit], the first one fastest."""
+        first, second = np.meshgrid(*self.grid.values())
+        return np.stack([first.ravel(), second.ravel()], axis=1)
 
     @property
     def values(self) -> Float[np.ndarray, "point cv"]:
@@ -107,8 +105,8 @@ class SteadyMap:
 
     def _possible_triangles(self) -> Int[np.ndarray, "triangle 3"]:
         """All triangles, those without a steady state too."""
-        width = len(self.choke)
-        i, j = np.meshgrid(np.arange(width - 1), np.arange(len(self.lift) - 1))
+        width, height = map(len, self.grid.values())
+        i, j = np.meshgrid(np.arange(width - 1), np.arange(height - 1))
         first = (i + width * j).ravel()
         corners = np.stack([first, first + 1, first + width, first + width + 1], axis=1)
         parity = (i + j).reshape(-1, 1, 1) % 2  # Union Jack: the diagonal turns from cell to cell
@@ -118,26 +116,24 @@ class SteadyMap:
     def _unknown(self) -> Int[np.ndarray, " point"]:
         return np.flatnonzero(np.isnan(self.values).any(axis=1))
 
-    def interpolate(self, choke, lift) -> Float[np.ndarray, "cv ..."]:
-        """CVs at positions [%] and lift rates [m3/h] of any shape, linear over the triangles; NaN outside of them."""
-        choke, lift = np.broadcast_arrays(np.asarray(choke, np.float64), np.asarray(lift, np.float64))
+    def interpolate(self, first, second) -> Float[np.ndarray, "cv ..."]:
+        """CVs at values of both MVs [MV unit] of any shape, linear over the triangles; NaN outside of them."""
+        first, second = np.broadcast_arrays(np.asarray(first, np.float64), np.asarray(second, np.float64))
         triangles, values = self.triangles, self.values
-        out = np.full((choke.size, len(self.cv_names)), np.nan)
-        for k, point in enumerate(zip(choke.ravel(), lift.ravel(), strict=True)):
+        out = np.full((first.size, len(self.cv_names)), np.nan)
+        for k, point in enumerate(zip(first.ravel(), second.ravel(), strict=True)):
             shares = barycentric(self.points[triangles], np.array(point))
             inside = np.flatnonzero((shares >= -INSIDE).all(axis=1))
             if len(inside):
                 out[k] = shares[inside[0]] @ values[triangles[inside[0]]]
-        return np.moveaxis(out.reshape(*choke.shape, -1), -1, 0)
+        return np.moveaxis(out.reshape(*first.shape, -1), -1, 0)
 
     def save(self, path: str | Path) -> Path:
         """Write the map as JSON, ``null`` where there is no steady state; the file is replaced in one go."""
         body = {
             "format": FORMAT,
-            "choke": self.choke.tolist(),
-            "lift": self.lift.tolist(),
             "cv": list(self.cv_names),
-            "mv": list(self.mv_names),
+            "grid": {name: values.tolist() for name, values in self.grid.items()},
             "cv_units": list(self.cv_units),
             "mv_units": list(self.mv_units),
             "provenance": dict(self.provenance),
@@ -148,18 +144,20 @@ class SteadyMap:
     @classmethod
     def load(cls, path: str | Path) -> SteadyMap:
         """Read a map written by `save`. Raises `InputError` naming the field that is wrong."""
-        body = read_json("map file", path)
+        body: Any = read_json("map file", path)
         if not isinstance(body, dict):
-            raise InputError("map file", str(path), "a JSON object with choke, lift, cv and values")
-        check_keys("map", body, ("choke", "lift", "cv", "values"))
+            raise InputError("map file", str(path), "a JSON object with grid, cv and values")
+        if body.get("format") == OLD_FORMAT:  # the values of the MVs are what has no name of the format
+            check_keys("map", body, ("mv",))
+            values = [value for key, value in body.items() if key not in OLD_KEYS]
+            body["grid"] = dict(zip(body["mv"], values, strict=False))
+        check_keys("map", body, ("grid", "cv", "values"))
         return cls(
-            body["choke"],
-            body["lift"],
+            body["grid"],
             body["values"],
             body["cv"],
-            body.get("mv", ("choke", "gas_lift")),
             body.get("cv_units", ()),
-            body.get("mv_units", ("%", "m3/h")),
+            body.get("mv_units", ()),
             body.get("provenance", {}),
         )
 
@@ -181,3 +179,22 @@ def _with_null(values):
     if isinstance(values, list):
         return [_with_null(value) for value in values]
     return None if np.isnan(values) else values
+
+
+def _checked(grid: Any, units: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """The increasing values of two MVs, or an `InputError` that names the MV."""
+    if not isinstance(grid, Mapping) or len(grid) != 2:
+        raise InputError("map.grid", grid, "two MVs by name, each with its increasing values [MV unit]")
+    found = {}
+    for name, unit in itertools.zip_longest(grid, units[:2], fillvalue=""):
+        expected = f"two or more increasing values [{unit or 'MV unit'}]"
+        values = as_floats(f"map.grid.{name}", grid[name], expected)
+        if (
+            values.ndim != 1
+            or len(values) < 2
+            or not np.isfinite(values).all()
+            or (np.diff(values) <= 0).any()
+        ):
+            raise InputError(f"map.grid.{name}", values.tolist(), expected)
+        found[name] = values
+    return found

@@ -7,11 +7,12 @@ logarithmic form of Vielma and Nemhauser (2011): one share lambda_v per grid poi
 
 and binaries that leave no two shares positive that have no triangle in common: a Gray code of the cell in either
 direction, and one bit for the half of the cell. The relaxation without the other integers is the convex hull of the
-function's graph. The forbidden band of the lift (6.19e) is one binary per allowed range, the step choke one whole number.
+function's graph. An MV with forbidden bands (6.19e) has one binary per allowed range, one on whole steps an integer.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -29,7 +30,7 @@ class Best(NamedTuple):
     """Result of `PiecewiseMilp.solve`.
 
     Attributes:
-        mv: choke [%] and lift [m3/h], exactly on a step and inside a range.
+        mv: the MVs of the map [MV unit], exactly on a step and inside a range.
         goal: what came first: ``violation`` where the limits are out of reach, else ``distance`` where there is a
             demand, else ``profit``.
         bound: proven limit of it, in its own unit: from above for the profit, from below for the others.
@@ -50,7 +51,8 @@ class PiecewiseMilp:
         span: size of each CV, for scaling.
         low, high: limits per CV, infinite for none.
         demand: per CV, NaN for none.
-        choke_step: of the step choke, None for any position.
+        ranges: per MV, the pairs of smallest and largest value that are allowed.
+        steps: per MV, on whose whole multiples it stands, None for any value.
     """
 
     def __init__(
@@ -63,17 +65,19 @@ class PiecewiseMilp:
         low: Float[np.ndarray, " cv"],
         high: Float[np.ndarray, " cv"],
         demand: Float[np.ndarray, " cv"],
-        lift_ranges: list[tuple[float, float]],
-        choke: tuple[float, float],
-        choke_step: float | None,
+        ranges: Sequence[Sequence[tuple[float, float]]],
+        steps: Sequence[float | None],
     ):
         points = map.points
-        self.points, self.choke, self.choke_step, self.ranges = points, choke, choke_step, lift_ranges
+        self.points, self.ranges, self.steps = points, ranges, steps
         used = np.isin(np.arange(len(points)), map.triangles)
         values, profit = np.where(used[:, None], map.values, 0.0), np.where(used, profit, 0.0)
         count, cvs = values.shape
-        codes = _exclusions(len(map.choke), len(map.lift)) + [(e[:1], e[1:]) for e in map.loose_edges]
-        size = {"share": count, "code": len(codes), "range": len(lift_ranges), "steps": 1}
+        width, height = (len(values) for values in map.grid.values())
+        codes = _exclusions(width, height) + [(e[:1], e[1:]) for e in map.loose_edges]
+        size = {"share": count, "code": len(codes)}
+        size |= {f"range {k}": len(own) for k, own in enumerate(ranges) if len(own) > 1}
+        size |= {f"steps {k}": 1 for k, step in enumerate(steps) if step is not None}
         size |= dict.fromkeys(("above", "below", "more", "less"), cvs)  # violations, deviations per CV [span]
         ends = np.cumsum(list(size.values()))
         at = {name: np.arange(end - n, end) for (name, n), end in zip(size.items(), ends, strict=True)}
@@ -83,29 +87,32 @@ class PiecewiseMilp:
         self._row_high: list[float] = []
         self.low, self.high = np.zeros(total), np.ones(total)
         self.high[at["share"]] = used
-        self.high[np.concatenate([at["above"], at["below"], at["steps"]])] = 0.0
+        self.high[np.concatenate([at["above"], at["below"]])] = 0.0
         self.integer = np.zeros(total, dtype=bool)
-        self.integer[np.concatenate([at["code"], at["range"], at["steps"]])] = True
+        self.integer[count : at["above"][0]] = True  # codes, ranges and steps
         one = np.ones
         self._row(1.0, 1.0, at["share"], one(count))
         for bit, (ones, zeros) in zip(at["code"], codes, strict=True):
             self._row(-np.inf, 0.0, np.append(ones, bit), np.append(one(len(ones)), -1.0))
             self._row(-np.inf, 1.0, np.append(zeros, bit), one(len(zeros) + 1))
-        self._row(1.0, 1.0, at["range"], one(len(lift_ranges)))
         unit = np.maximum(np.abs(points).max(axis=0), 1e-12)
-        of_choke, of_lift = points[:, 0] / unit[0], points[:, 1] / unit[1]
-        for k, side in ((0, (0.0, np.inf)), (1, (-np.inf, 0.0))):  # (6.19e)
-            ends_of = np.array([r[k] for r in lift_ranges]) / unit[1]
-            self._row(*side, np.concatenate([at["share"], at["range"]]), np.concatenate([of_lift, -ends_of]))
-        self._row(choke[0] / unit[0], choke[1] / unit[0], at["share"], of_choke)
-        self.empty = False
-        if choke_step is not None:
-            n = at["steps"]
-            self.low[n] = np.ceil(choke[0] / choke_step - 1e-9)
-            self.high[n] = np.floor(choke[1] / choke_step + 1e-9)
-            self.empty = bool((self.low[n] > self.high[n]).any())
-            index = np.append(at["share"], n)
-            self._row(0.0, 0.0, index, np.append(of_choke, -choke_step / unit[0]))
+        scaled = points / unit
+        # the MVs with bands first: HiGHS may end elsewhere among equally good points if rows change places
+        for k, own in sorted(enumerate(ranges), key=lambda row: len(row[1]) == 1):  # (6.19e)
+            if len(own) == 1:
+                self._row(own[0][0] / unit[k], own[0][1] / unit[k], at["share"], scaled[:, k])
+                continue
+            chosen = at[f"range {k}"]
+            self._row(1.0, 1.0, chosen, one(len(own)))
+            for ends, side in zip(np.array(own).T / unit[k], ((0.0, np.inf), (-np.inf, 0.0)), strict=True):
+                self._row(*side, np.append(at["share"], chosen), np.append(scaled[:, k], -ends))
+        for k, step in enumerate(steps):
+            if step is not None:
+                n = at[f"steps {k}"]
+                self.low[n] = np.ceil(np.min(ranges[k]) / step - 1e-9)
+                self.high[n] = np.floor(np.max(ranges[k]) / step + 1e-9)
+                self._row(0.0, 0.0, np.append(at["share"], n), np.append(scaled[:, k], -step / unit[k]))
+        self.empty = bool((self.low > self.high).any())
         wanted = np.isfinite(demand)
         for c in range(cvs):
             rate = values[:, c] / span[c]
@@ -165,13 +172,15 @@ class PiecewiseMilp:
         return not self.demanded or bool(self.cost[goal].any())
 
     def _mv(self, x: np.ndarray) -> np.ndarray:
-        """Choke and lift of a solution, the tolerances of the solver taken out."""
+        """The MVs of a solution, the tolerances of the solver taken out."""
         shares = np.maximum(x[self.at["share"]], 0.0)
-        choke, lift = shares @ self.points / shares.sum()
-        if self.choke_step is not None:
-            choke = self.choke_step * np.round(x[self.at["steps"][0]])
-        least, most = self.ranges[int(np.argmax(x[self.at["range"]]))]
-        return np.array([np.clip(choke, *self.choke), np.clip(lift, least, most)])
+        mv = shares @ self.points / shares.sum()
+        for k, (own, step) in enumerate(zip(self.ranges, self.steps, strict=True)):
+            if step is not None:
+                mv[k] = step * np.round(x[self.at[f"steps {k}"][0]])
+            chosen = int(np.argmax(x[self.at[f"range {k}"]])) if len(own) > 1 else 0
+            mv[k] = np.clip(mv[k], *own[chosen])
+        return mv
 
     def _minimise(self, goal: Goal, known: np.ndarray | None = None) -> tuple[np.ndarray | None, float]:
         """Best solution of one goal and the bound, in units of the problem; None if there is none.

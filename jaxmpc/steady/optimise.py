@@ -1,15 +1,16 @@
-"""Real-time optimisation of the well's steady state (thesis 6.7): which rates to ask for, and with which choke and lift.
+"""Real-time optimisation of a steady state (thesis 6.7): which CVs to ask for, and with which MVs.
 
-The steady rates are a function of choke and lift (6.19b), given on a grid and linear over the triangles between its
-points. `optimise` finds the most profitable point (6.19a) of that function inside limits of the rates and outside a
-forbidden band of the lift, or the point closest to rates that were demanded, as an exact mixed-integer linear
-programme. Its `Targets` are setpoints for the CVs and, by `jaxmpc.controller.targets`, for the MVs of a controller.
+The steady CVs are a function of two MVs (6.19b), given on a grid and linear over the triangles between its points.
+`optimise` finds the most profitable point (6.19a) of that function inside limits of the CVs and outside forbidden bands of
+the MVs, or the point closest to CVs that were demanded, as an exact mixed-integer linear programme. Its `Targets` are
+setpoints for the CVs and, by `jaxmpc.controller.targets`, for the MVs of a controller.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -19,7 +20,7 @@ from jaxmpc.errors import InputError
 from jaxmpc.steady.map import SteadyMap, barycentric
 from jaxmpc.steady.milp import PiecewiseMilp
 
-LIFT_RANGES = ((0.0, 0.0), (2000.0, 10_000.0))  # m3/h: no lift, or enough of it not to slug (thesis 6.7.1)
+Pair = tuple[float, float]
 MET = 1e-7  # share of a CV's span up to which a limit counts as met and a demand as reached
 
 
@@ -28,12 +29,12 @@ class Targets:
     """A steady state to aim at, in engineering units.
 
     Attributes:
-        status: ``optimal``: the most profitable point within the limits, or the demanded rates; ``closest``: limits or
+        status: ``optimal``: the most profitable point within the limits, or the demanded CVs; ``closest``: limits or
             demand are out of reach, and this is the point closest to them.
         feasible: whether the limits are met and the demand, if there is one, is reached.
         message: what could not be met and by how much, or that nothing was in the way.
         cv: ``"cv"``, setpoints of the CVs [CV unit].
-        mv: ``"mv"``, choke [%] and lift [m3/h].
+        mv: ``"mv"``, the MVs of the map [MV unit].
         profit: (6.19a) with its sign turned [price unit per hour].
         violation: ``"cv"``, how far each CV is outside its limits [CV unit].
         deviation: ``"cv"``, CV minus demand [CV unit], NaN where nothing is demanded.
@@ -65,9 +66,8 @@ def optimise(
     cv_low: Mapping[str, float | None] | Sequence[float | None] | None = None,
     cv_high: Mapping[str, float | None] | Sequence[float | None] | None = None,
     *,
-    lift_ranges: Sequence[tuple[float, float]] = LIFT_RANGES,
-    choke: tuple[float, float] = (0.0, 100.0),
-    choke_step: float | None = None,
+    mv_ranges: Mapping[str, Sequence[Pair]] | None = None,
+    mv_steps: Mapping[str, float] | None = None,
     target: Mapping[str, float] | None = None,
     weights: Mapping[str, float] | None = None,
 ) -> Targets:
@@ -75,22 +75,22 @@ def optimise(
 
     Without a demand the profit is maximised (6.19a), ::
 
-        max  sum_cv price_cv Y_cv - price_lift u_lift                     (6.19a)
-        s.t. Y = f(u_choke, u_lift),  cv_low <= Y <= cv_high              (6.19b)-(6.19d)
-             u_lift in one of `lift_ranges`                               (6.19e)
-             u_choke in the range `choke`, and a whole number of `choke_step` if given
+        max  sum_cv price_cv Y_cv - sum_mv price_mv u_mv          (6.19a)
+        s.t. Y = f(u),  cv_low <= Y <= cv_high                    (6.19b)-(6.19d)
+             u_mv in one of its `mv_ranges`                       (6.19e)
+             u_mv a whole number of its step in `mv_steps`
 
     with f linear over the triangles of the map. With a demand, sum_cv weight_cv |Y_cv - target_cv| is minimised first
     and the profit is maximised among the points that are as close. Where no point is within the CV limits, the
     weighted sum of the violations is minimised before both. MV limits are never left.
 
     Args:
-        map: steady CVs; choke and lift beyond its grid are out of reach.
-        prices: per m3 of each CV, and under the name of the lift the cost per m3 of lift gas; 0 where not named.
+        map: steady CVs; MVs beyond its grid are out of reach.
+        prices: of each CV [per CV unit], and under the name of an MV its cost [per MV unit]; 0 where not named.
         cv_low, cv_high: limits by CV name or in CV order [CV unit]; None for no limit.
-        lift_ranges: pairs of smallest and largest lift [m3/h]; ``(0, 0)`` allows no lift.
-        choke: smallest and largest position [%].
-        choke_step: the choke stands on whole multiples of it [%]; None for any position.
+        mv_ranges: by MV name, pairs of smallest and largest value [MV unit] of which one holds: a single pair is a range,
+            two leave a forbidden band between them, and ``(0, 0)`` allows off; the grid of the map where not named.
+        mv_steps: by MV name, the step on whose whole multiples the MV stands [MV unit]; any value where not named.
         target: demanded CVs by name [CV unit], some or all.
         weights: of deviations and violations by CV name [1/CV unit]; 1 over the CV's span in the map where not named.
 
@@ -98,11 +98,11 @@ def optimise(
         `Targets`; where limits or demand are out of reach they say so and are the closest point there is.
 
     Raises:
-        InputError: naming the field, for unknown names, numbers that are not finite, crossed limits, or lift and choke
-            limits that leave nothing of the map.
+        InputError: naming the field, for unknown names, numbers that are not finite, crossed limits, or MV ranges and
+            steps that leave nothing of the map.
     """
-    names, lift_name = map.cv_names, map.mv_names[1]
-    price = _named("prices", prices, (*names, lift_name), "price per m3")
+    names, mv_names = map.cv_names, map.mv_names
+    price = _named("prices", prices, (*names, *mv_names), "price per unit")
     low = _limits("cv_low", cv_low, map, -np.inf)
     high = _limits("cv_high", cv_high, map, np.inf)
     for name, unit, least, most in zip(names, map.cv_units, low, high, strict=True):
@@ -110,10 +110,7 @@ def optimise(
             raise InputError(
                 f"cv_low.{name}", float(least), f"at most cv_high.{name} = {float(most)!r} [{unit}]"
             )
-    ranges = _ranges(lift_ranges)
-    choke_low, choke_high = _pair("choke", choke, "%")
-    if choke_step is not None and not (is_number(choke_step) and choke_step > 0):
-        raise InputError("choke_step", choke_step, "a positive step [%], or None for any position")
+    ranges, steps = _ranges(mv_ranges, map), _steps(mv_steps, map)
     demanded = _named("target", target, names, "CV unit")
     demand = np.array([demanded.get(name, np.nan) for name in names])
     span = np.ptp(map.values[np.unique(map.triangles)], axis=0)
@@ -124,27 +121,24 @@ def optimise(
         raise InputError("weights", weights, "0 or more [1/CV unit], not all of them 0")
 
     value = np.array([price.get(name, 0.0) for name in names])
-    cost_of_lift = price.get(lift_name, 0.0)
+    cost = np.array([price.get(name, 0.0) for name in mv_names])
     milp = PiecewiseMilp(
         map=map,
-        profit=map.values @ value - cost_of_lift * map.points[:, 1],
+        profit=map.values @ value - map.points @ cost,
         weight=weight,
         span=span,
         low=low,
         high=high,
         demand=demand,
-        lift_ranges=ranges,
-        choke=(choke_low, choke_high),
-        choke_step=choke_step,
+        ranges=ranges,
+        steps=steps,
     )
     best = milp.solve()
     if best is None:
-        step = "" if choke_step is None else f" on whole steps of {choke_step:g} %"
         raise InputError(
-            "lift_ranges, choke",
-            f"{[list(r) for r in ranges]} m3/h, {choke_low:g} to {choke_high:g} %{step}",
-            f"some of the map: lift {map.lift[0]:g} to {map.lift[-1]:g} m3/h, choke {map.choke[0]:g} to "
-            f"{map.choke[-1]:g} %, less where there is no steady state",
+            "mv_ranges, mv_steps",
+            _said(map, ranges, steps),
+            f"some of the map: {_said(map, _ranges(None, map), (None, None))}, less where there is no steady state",
         )
     mv = best.mv
     shares = barycentric(map.points[map.triangles], mv)
@@ -156,7 +150,7 @@ def optimise(
     violation[violation <= MET * span] = 0.0
     deviation = cv - demand
     deviation[np.abs(deviation) <= MET * span] = 0.0
-    profit = float(value @ cv - cost_of_lift * mv[1])
+    profit = float(value @ cv - cost @ mv)
     distance = float(np.nansum(weight * np.abs(deviation)))
     # a deviation without weight is none of anyone's business
     missed = (np.nan_to_num(deviation) != 0) & (weight > 0)
@@ -176,7 +170,7 @@ def optimise(
         bound=best.bound,
         gap=abs(best.bound - reached) / scale,
         cv_names=names,
-        mv_names=map.mv_names,
+        mv_names=mv_names,
     )
 
 
@@ -226,7 +220,25 @@ def _limits(path: str, given, map: SteadyMap, infinite: float) -> np.ndarray:
     return np.array([found.get(name, infinite) for name in names])
 
 
-def _pair(path: str, given, unit: str) -> tuple[float, float]:
+def _ranges(given, map: SteadyMap) -> list[list[Pair]]:
+    """The allowed ranges per MV in rising order."""
+    listed_by = _by_mv(
+        "mv_ranges", given, map, "a mapping from MV name to pairs of smallest and largest value"
+    )
+    out = []
+    for (name, grid), unit in zip(map.grid.items(), map.mv_units, strict=True):
+        path, listed = f"mv_ranges.{name}", listed_by.get(name, [(grid[0], grid[-1])])
+        try:
+            pairs = list(listed)
+        except TypeError:
+            pairs = []
+        if not pairs:
+            raise InputError(path, listed, f"one or more pairs of smallest and largest value [{unit}]")
+        out.append(sorted(_pair(f"{path}[{i}]", pair, unit) for i, pair in enumerate(pairs)))
+    return out
+
+
+def _pair(path: str, given, unit: str) -> Pair:
     try:
         least, most = given
     except (TypeError, ValueError):
@@ -236,12 +248,34 @@ def _pair(path: str, given, unit: str) -> tuple[float, float]:
     return float(least), float(most)
 
 
-def _ranges(given) -> list[tuple[float, float]]:
-    """The lift ranges in rising order."""
-    try:
-        pairs = list(given)
-    except TypeError:
-        pairs = []
-    if not pairs:
-        raise InputError("lift_ranges", given, "one or more pairs of smallest and largest lift [m3/h]")
-    return sorted(_pair(f"lift_ranges[{i}]", pair, "m3/h") for i, pair in enumerate(pairs))
+def _steps(given, map: SteadyMap) -> list[float | None]:
+    """The step per MV."""
+    steps = _by_mv("mv_steps", given, map, "a mapping from MV name to step")
+    for name, unit in zip(map.mv_names, map.mv_units, strict=True):
+        if name in steps and not (is_number(steps[name]) and steps[name] > 0):
+            raise InputError(f"mv_steps.{name}", steps[name], f"a positive step [{unit}]")
+    return [float(steps[name]) if name in steps else None for name in map.mv_names]
+
+
+def _by_mv(path: str, given, map: SteadyMap, expected: str) -> Mapping[str, Any]:
+    """What is given by the names of MVs."""
+    given = {} if given is None else given
+    if not isinstance(given, Mapping):
+        raise InputError(path, given, expected)
+    for name, value in given.items():
+        if name not in map.mv_names:
+            raise InputError(f"{path}.{name}", value, f"one of the names {', '.join(map.mv_names)}")
+    return given
+
+
+def _said(map: SteadyMap, ranges, steps) -> str:
+    """Ranges and steps of the MVs in words."""
+    parts = []
+    for name, unit, own, step in zip(map.mv_names, map.mv_units, ranges, steps, strict=True):
+        pairs = " or ".join(
+            f"{least:g}" if least == most else f"{least:g} to {most:g}" for least, most in own
+        )
+        parts.append(
+            f"{name} {pairs} {unit}" + ("" if step is None else f" on whole steps of {step:g} {unit}")
+        )
+    return ", ".join(parts)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 from identify.step_test import identify_step_response
 from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.process.well.plant import WellPlant
 from studies.bench.instances import MODES, Mode, Recordings
 from studies.bench.peers import Peer
 from studies.thesis.well import WELL
@@ -85,7 +86,7 @@ class Context:
     @functools.cached_property
     def model(self) -> StepResponseModel:
         """Identified from the JAX well."""
-        return identify_step_response()
+        return identify_step_response(WellPlant())
 
     @functools.cached_property
     def recordings(self) -> Recordings:

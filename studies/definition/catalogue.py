@@ -100,6 +100,8 @@ def _comparison(path: Path, told: dict[str, Any], quick: bool, plant: str, given
         asked = short.get("controllers", [one["name"] for one in runs])
         runs = [one for one in runs if one["name"] in asked]
         told |= {"title": f"{told.get('title', path.stem)}, shortened", **short}
+    if quick and not of_file and "quick" in process.references:
+        told.setdefault("reference", "quick")
     windows, duration, known = (told.pop(key, None) for key in ("windows", "duration", "reference"))
     reference = windows_reference("", windows, duration, process.cvs) if windows else process.reference(known)
     if not windows and duration is not None:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
+import numpy as np
+
 from identify.plants import model_of, open_plant
+from identify.working_point import check_mv
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.process import Process
@@ -27,13 +30,17 @@ def identify_models(
     """
     wanted = list(dict.fromkeys(tuple(map(float, point)) for point in points))
     plant = None if process.model.file else open_plant(process, actual=False)
+    steps = np.array([process.model.steps.get(mv.name, 0.0) for mv in process.mvs])
     for point in wanted if plant is not None else ():
         named = zip(process.mvs, point, strict=True)
         here = ", ".join(f"model.{mv.name} = {value:g} {mv.unit}" for mv, value in named)
         try:
-            settles = plant.settles(point) if hasattr(plant, "settles") else True  # pyright: ignore[reportOptionalMemberAccess]
+            check_mv(plant, np.array(point))
+            check_mv(plant, np.array(point) + steps)
         except InputError as error:
-            raise InputError(here, error.value, error.expected, error.hint) from None
+            further = ", ".join(f"{step:g} {mv.unit}" for step, mv in zip(steps, process.mvs, strict=True))
+            raise InputError(here, error.value, f"{error.expected}, also {further} further") from None
+        settles = plant.steady(np.array(point)).converged if hasattr(plant, "steady") else True  # type: ignore[union-attr]
         require(settles, here, "no steady state", "a working point at which the plant settles")
     out = {}
     for point in wanted:

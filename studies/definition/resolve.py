@@ -8,6 +8,7 @@ length) is built as typed objects, once per distinct combination.
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -274,7 +275,7 @@ def _number(field: str, preset: dict[str, Any], name: str) -> float:
     """A preset's value of a field, or what holds where it says nothing."""
     value = preset.get(field)
     value = value.get(name) if isinstance(value, dict) else value
-    return TUNING[field].default if value is None else value
+    return float(TUNING[field].default if value is None else value)
 
 
 # ----------------------------------------------------------------------------------------- plant and disturbances
@@ -298,7 +299,7 @@ def _plant(settings: Settings) -> dict[str, np.ndarray]:
         return out
     plant = open_plant(process, name)
     try:
-        plant.replaced(out)
+        plant.replaced({key: np.broadcast_to(values, settings.count) for key, values in out.items()})
     except InputError as error:
         raise _located(settings, plant, out, error) from None
     finally:
@@ -313,11 +314,12 @@ def _located(settings: Settings, plant: Any, given: dict[str, np.ndarray], error
         try:
             plant.replaced({name: float(row(values, k)) for name, values in given.items()})
         except InputError as found:
-            name = found.field.rpartition("plant.")[2]
+            name = found.field.rpartition(".")[2]
             names = [name, *(other for other in given if other != name and other in found.expected)]
             keys = [f"{table}.{n}" for n in names for table in ("plant", "plant_scale")]
             keys = list(filter(settings.given, keys)) or [f"plant.{name}"]
-            expected = f"{found.expected} for {keys[0]}"
+            bare = re.sub(r" (\[[^]]*\]|\(SI units\))", "", found.expected)
+            expected = f"{bare} [{settings.fields[keys[0]].unit}] for {keys[0]}"
             return InputError(settings.table.blame(keys, k), settings.value(keys[0], k), expected)
     return error
 

@@ -186,7 +186,7 @@ class Study:
             self._process,
             self._variant_hashes[inputs.variant[k]],
             {name: row(values, k).tolist() for name, values in inputs.tuning.items()},
-            {name: float(row(values, k)) for name, values in inputs.plant.items()},
+            self._changed(k),
             row(inputs.point, k).tolist(),
             [*noise.tolist(), int(row(inputs.seed, k))] if noise.any() else None,  # no noise, no seed
             self._disturbance(k),
@@ -255,6 +255,12 @@ class Study:
         whole = isinstance(k, (int, np.integer)) and not isinstance(k, bool)
         require(whole and 0 <= k < self.count, "scenario", k, f"a number from 0 to {self.count - 1}")
         return self._inputs.variants[self._inputs.variant[k]]
+
+    def _changed(self, k: int) -> dict[str, float]:
+        """Parameters of the plant that are not its own."""
+        values = {name: float(row(given, k)) for name, given in self._inputs.plant.items()}
+        own = {name: self.definition.fields[f"plant.{name}"].default for name in values}
+        return {name: value for name, value in values.items() if value != own[name]}
 
     def _disturbance(self, k: int) -> np.ndarray | None:
         """Disturbances "sample disturbance"."""

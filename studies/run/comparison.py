@@ -81,8 +81,7 @@ def run_comparison(
     }
     scheduled: dict[str, Any] = {}
     if schedule is not None:
-        parts = schedule.choke, schedule.lift, schedule.coefficients
-        scheduled["schedule"] = [np.asarray(part) for part in parts]
+        scheduled["schedule"] = [np.asarray(part) for part in (*schedule.grid, schedule.coefficients)]
     hashes = [
         content_hash(inputs | (scheduled if controller.schedule else {}), controller.resolved(process))
         for controller in definition.controllers

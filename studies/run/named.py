@@ -8,9 +8,10 @@ from typing import Any
 
 import xarray as xr
 
-from identify.plants import model_of, open_plant, plant_facts
+from identify.plants import model_of, open_plant, plant_facts, signals_in
 from identify.schedule import identify_schedule
 from identify.step_test import settling_notes
+from jaxmpc.errors import InputError
 from studies.definition.catalogue import Comparison
 from studies.run.comparison import closing, run_comparison
 from studies.store.files import RESULTS
@@ -50,7 +51,11 @@ def run_named(
         model.save(folder / "model.json")
         schedule = None
         if any(controller.schedule for controller in definition.controllers):
-            schedule = identify_schedule(tested)
+            grid = process.model.schedule
+            if not grid:
+                expected = "positions of one or two MVs at which models are identified: a controller follows a schedule"
+                raise InputError("model.schedule", {}, expected)
+            schedule = identify_schedule(tested, grid, signals=signals_in(process))
             schedule.save(folder / "schedule.json")
         return run_comparison(
             definition,
@@ -58,7 +63,7 @@ def run_named(
             folder,
             model=model,
             make_plant=lambda actual: open_plant(process, definition.plant, actual=actual),
-            plant_facts=plant_facts(process, definition.plant, tested),
+            plant_facts=plant_facts(process, tested),
             extra=lambda: extra(tested),
             others=sorted(Path(out).glob(f"*/{RESULTS}")),
             schedule=schedule,

@@ -26,8 +26,9 @@ from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure
 from jaxmpc.process.reference import Reference
+from jaxmpc.process.well.grids import LIFT_RANGES, STEADY_MAP
 from jaxmpc.steady.map import SteadyMap
-from jaxmpc.steady.optimise import LIFT_RANGES, Targets, optimise
+from jaxmpc.steady.optimise import Targets, optimise
 from studies.run.comparison import closing, labelled, progress_bar, results_layout, run_missing
 from studies.store.files import RESULTS
 from studies.store.fingerprint import content_hash, module_hash, source_hash
@@ -65,7 +66,14 @@ def demands(quick: bool = False) -> Reference:
 def targets_of(steady: SteadyMap, demanded: Reference, deadzone: np.ndarray) -> list[Targets]:
     """What the real-time optimisation makes of each demand: the most profitable point within its deadzone [CV unit]."""
     return [
-        optimise(steady, PRICES, rates - deadzone, rates + deadzone, choke_step=WELL.mvs[0].actuator.step)
+        optimise(
+            steady,
+            PRICES,
+            rates - deadzone,
+            rates + deadzone,
+            mv_ranges={CHOKE: [(0.0, 100.0)], LIFT: LIFT_RANGES},
+            mv_steps={CHOKE: WELL.mvs[0].actuator.step},
+        )
         for rates in demanded.setpoints
     ]
 
@@ -93,8 +101,8 @@ def run_rto(
     demanded = demands(quick)
     with locked(folder / RESULTS):
         with closing(open_plant(WELL, plant, actual=False)) as tested:
-            model, steady = model_of(WELL, tested), steady_map(tested)
-            facts = plant_facts(WELL, plant, tested)
+            model, steady = model_of(WELL, tested), steady_map(tested, STEADY_MAP)
+            facts = plant_facts(WELL, tested)
         model.save(folder / "model.json")
         steady.save(folder / "steady_map.json")
         structure = WELL.structure(integer=True)
@@ -191,7 +199,7 @@ def _shared(
         "profit": labelled(profit, ("demand",), "steady profit of the target", "1/h"),
         "tuning_deadzone": labelled(half, ("controller", "cv"), "half width of the deadzone", "cv_unit"),
         **texts,
-        "map_rate": over_inputs("map", steady.choke, steady.lift, steady.cv, "steady CV", "cv_unit"),
+        "map_rate": over_inputs("map", steady.grid, steady.cv, "steady CV", "cv_unit"),
     }
 
 

@@ -111,7 +111,7 @@ def test_every_command_refuses_a_file_that_nobody_may_write(option, tmp_path, ca
 
 
 def test_a_fit_does_not_overwrite_what_it_reads(tmp_path, capsys):
-    from identify.fit import main as fit
+    from identify.well_fit import main as fit
     from jaxmpc.process.well.equations import WellParameters, save_parameters
     from tests.conftest import second_order
 

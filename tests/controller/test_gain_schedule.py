@@ -115,8 +115,10 @@ def test_a_schedule_of_a_single_model_is_that_model_everywhere(well_like_model):
 
 def test_a_saved_schedule_is_read_back_unchanged(varied, tmp_path):
     again = ModelSchedule.load(varied.save(tmp_path / "schedule.json"))
-    for key in ("choke", "lift", "coefficients"):
-        assert np.array_equal(getattr(again, key), getattr(varied, key))
+    assert np.array_equal(again.coefficients, varied.coefficients)
+    assert again.scheduled == varied.scheduled == ("choke", "lift")
+    for one, other in zip(again.grid, varied.grid, strict=True):
+        assert np.array_equal(one, other)
     assert again.reference.mv_names == varied.reference.mv_names
     assert again.reference.dt == varied.reference.dt
 
@@ -125,7 +127,8 @@ def test_a_saved_schedule_is_read_back_unchanged(varied, tmp_path):
     ("spoil", "field"),
     [
         (lambda body: body.pop("grid"), "schedule.grid"),
-        (lambda body: body["grid"].pop("lift"), "schedule.grid"),
+        (lambda body: body["grid"].update(speed=[1.0]), "schedule.grid"),
+        (lambda body: body["grid"].pop("lift"), "schedule.coefficients[0].coefficients"),
         (lambda body: body["coefficients"].pop(), "schedule.coefficients"),
         (
             lambda body: body["coefficients"][1][0][0].__setitem__(1, [1.0]),
@@ -149,6 +152,8 @@ def test_models_that_do_not_fill_a_grid_are_refused(well_like_model):
         make_schedule(models[:-1])
     with pytest.raises(InputError, match="no other model"):
         make_schedule([*models, models[0]])
+    with pytest.raises(InputError, match=r"scheduled.*one or two of choke, lift"):
+        make_schedule(models, ["speed"])
     with pytest.raises(InputError, match="working_point"):
         make_schedule([dataclasses.replace(models[0], working_point=(("choke", 10.0),))])
 
@@ -266,6 +271,7 @@ def test_the_table_makes_a_controller_once_per_position_and_keeps_the_latest(
     table.at([34.0, 7400.0])
     assert table.at([30.0, 7400.0]) is not first
     assert table.built == 4
+    assert ScheduledController(small_structure, small_tuning, varied).lanes.grid.tolist() == [2.0, 250.0]
     model = first.scenarios.models[0]
     assert model.coefficients == near(varied.model_at([30.0, 7500.0]).coefficients, rel=1e-12)
 

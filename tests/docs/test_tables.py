@@ -9,6 +9,7 @@ import pytest
 from jaxmpc.problem.declared import declared
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
+from studies.definition.fields import study_fields
 from studies.thesis.well import WELL
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -47,7 +48,7 @@ def keys_of_studies() -> str:
     """Every key below ``[base.tuning]``, with the default of the thesis preset."""
     structure = WELL.structure(integer=True)
     tuning, rows = WELL.tuning(structure), []
-    for key, field in FIELDS.items():
+    for key, field in study_fields(WELL, ()).items():
         _, name, *of = key.split(".") if key.startswith("tuning.") else ("", "")
         if name:
             names = structure.cv_names + structure.mv_names

@@ -19,6 +19,16 @@ def path(tmp_path_factory):
     return fmus.make_fmu(tmp_path_factory.mktemp("fmu"), fmus.describe(attributes=VARIES))
 
 
+@pytest.fixture(scope="module")
+def crashing(tmp_path_factory):
+    """An FMU that takes steps of one size and crashes when it is loaded."""
+    crash = "__attribute__((constructor)) static void f(void) { abort(); }"
+    experiment = 'startTime="0" stopTime="16" stepSize="0.1"'
+    return fmus.make_fmu(
+        tmp_path_factory.mktemp("crash"), fmus.describe(experiment=experiment), on_load=crash
+    )
+
+
 # ------------------------------------------------------------------------------------------------ what is exchanged
 
 
@@ -169,13 +179,11 @@ def test_an_fmu_that_ends_with_its_default_experiment_says_so_and_goes_on_when_i
     ],
 )
 def test_a_plant_that_the_fmu_cannot_be_is_refused_before_anything_of_the_fmu_runs(
-    tmp_path, change, field, reason
+    crashing, change, field, reason
 ):
-    crash = "__attribute__((constructor)) static void f(void) { abort(); }"
-    path = fmus.make_fmu(tmp_path, fmus.describe(experiment='stepSize="0.1"'), on_load=crash)
     given = {"mv": ["u"], "cv": ["sum"], "dt": 10.0} | change
     with pytest.raises(InputError, match=reason) as caught:
-        FmuPlant(path, **given)
+        FmuPlant(crashing, **given)
     assert caught.value.field == field
 
 

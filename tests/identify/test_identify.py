@@ -3,32 +3,151 @@
 import dataclasses
 import json
 from pathlib import Path
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from identify.fit import StepData, fit_well, load_step_data, main
+from identify.schedule import identify_schedule
 from identify.step_test import identify_step_response, settling, settling_notes
 from identify.sweep import steady_sweep
+from identify.well_fit import StepData, fit_well, load_step_data, main
 from identify.well_fmu import WellFmuPlant
+from jaxmpc.controller.schedule import ModelSchedule
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.process.plant import JaxPlant, Outputs, Signals, Steady
 from jaxmpc.process.well.equations import WellParameters, load_parameters, parameters_to_dict
+from jaxmpc.process.well.grids import SWEEP
 from jaxmpc.process.well.plant import STATE_SCALE, WellPlant, rates, steady_state
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data" / "single_well_step_response.json"
 
 
+TANKS = Signals(
+    ("level", "heat", "flow"),
+    ("pump", "steam", "valve"),
+    ("m", "C", "m3/h"),
+    ("m3/h", "kg/h", "%"),
+    ("mm/h",),
+)
+GAIN = np.array([[0.1, 0.0, -0.2], [-0.3, 0.02, 0.0], [0.5, 0.0, 0.4]])  # CV unit per MV unit
+OWN = np.array([10.0, 200.0, 40.0])  # where they start
+
+
+class Tanks(JaxPlant):
+    """Three CVs of first order, 60 s, over three MVs; quadratic in the valve around 40 %."""
+
+    disturbance_names: ClassVar[tuple[str, ...]] = ("rain",)
+    dt: float = 5.0
+    curved: float = 0.0
+
+    def init(self):
+        return self.steady(OWN).state
+
+    def aim(self, mv):
+        return jnp.asarray(GAIN) @ (mv - OWN) + self.curved * (mv[2] - 40.0) ** 2
+
+    def step(self, state, mv, disturbance):
+        cv = state[0] + (1.0 - np.exp(-5.0 / 60.0)) * (self.aim(mv) + jnp.sum(disturbance) - state[0])
+        return (cv, mv), Outputs(cv, mv)
+
+    def measure(self, state):
+        return Outputs(*state)
+
+    def steady(self, mv, disturbance=0.0):
+        cv, mv = self.aim(jnp.asarray(mv)) + disturbance, jnp.asarray(mv)
+        return Steady((cv, mv), Outputs(cv, mv), jnp.asarray(True))
+
+
+class OtherTanks:
+    """The same, stepped on the host, without names and steady states."""
+
+    dt, disturbance_names = 5.0, ("rain",)
+
+    def __init__(self):
+        self.plant = Tanks()
+
+    def init(self):
+        self.state = self.plant.init()
+        return self.plant.measure(self.state)
+
+    def step(self, mv, disturbance):
+        self.state, outputs = self.plant.step(self.state, mv, disturbance)
+        return outputs
+
+
+@pytest.mark.parametrize("plant", [Tanks(), OtherTanks()], ids=["JAX", "stateful"])
+def test_a_plant_of_any_size_and_kind_gives_its_gains_and_time_constant(plant):
+    point = {"steam": 250.0, "valve": 20.0, "pump": 11.0}
+    found = identify_step_response(
+        plant,
+        point,
+        {"pump": 1.0, "steam": -5.0, "valve": 2.0},
+        120,
+        disturbance_steps={"rain": 4.0},
+        signals=TANKS,
+    )
+    rise = 1.0 - np.exp(-5.0 * np.arange(1, 121) / 60.0)
+    np.testing.assert_allclose(
+        found.coefficients, GAIN[..., None] * rise, atol=1e-5
+    )  # held 15 time constants
+    np.testing.assert_allclose(found.dv_coefficients, np.tile(rise, (3, 1, 1)), atol=1e-5)
+    assert (found.cv_names, found.mv_units, found.dt) == (TANKS.cv_names, TANKS.mv_units, 5.0)
+    assert (found.dv_names, found.dv_units) == (("rain",), ("mm/h",))
+    assert dict(found.provenance)["steps"] == (1.0, -5.0, 2.0, 4.0)
+    where = dict(found.working_point)
+    assert [where[name] for name in TANKS.mv_names] == [11.0, 250.0, 20.0]
+    assert [where[name] for name in TANKS.cv_names] == pytest.approx(GAIN @ [1.0, 50.0, -20.0], abs=1e-3)
+
+
+def test_steps_both_ways_take_the_curvature_out():
+    options = dict(steps=(1.0, 5.0, 2.0), samples=100, signals=TANKS)
+    one, both = (identify_step_response(Tanks(curved=0.1), both_ways=way, **options) for way in (False, True))
+    assert both.coefficients[:, 2, -1] == pytest.approx(GAIN[:, 2], abs=1e-3)
+    assert one.coefficients[:, 2, -1] == pytest.approx(GAIN[:, 2] + 0.1 * 2.0, abs=1e-3)
+    assert dict(both.provenance)["steps"] == (1.0, 5.0, 2.0, -1.0, -5.0, -2.0)
+
+
+def test_a_sweep_over_two_of_three_mvs_holds_the_third():
+    sweep = steady_sweep(
+        Tanks(),
+        {"valve": [10.0, 20.0, 50.0], "pump": [9.0, 12.0]},
+        working_point=[1.0, 300.0, 2.0],
+        signals=TANKS,
+    )
+    at = lambda valve, pump: GAIN @ (np.array([pump, 300.0, valve]) - OWN)  # noqa: E731
+    expected = np.array([[at(valve, pump) for valve in (10.0, 20.0, 50.0)] for pump in (9.0, 12.0)])
+    np.testing.assert_allclose(np.moveaxis(sweep.cv, 0, -1), expected, rtol=1e-12)
+    np.testing.assert_allclose(
+        sweep.coefficient, np.broadcast_to(GAIN[:, 2, None, None], (3, 2, 2)), atol=1e-12
+    )
+    with pytest.raises(InputError, match="steady states"):
+        steady_sweep(OtherTanks(), {"valve": [10.0, 20.0], "pump": [9.0]}, signals=TANKS)
+
+
+def test_a_schedule_of_a_plant_of_three_mvs_is_over_those_that_are_named():
+    schedule = identify_schedule(
+        Tanks(curved=0.01), {"valve": (20.0, 60.0)}, (1.0, 5.0, 2.0), 100, signals=TANKS
+    )
+    for valve in (20.0, 30.0, 60.0):
+        gain = schedule.model_at([0.0, 0.0, valve]).coefficients[:, 2, -1]
+        assert np.asarray(gain) == pytest.approx(GAIN[:, 2] + 2 * 0.01 * (valve - 40.0), abs=1e-3)
+    again = ModelSchedule.from_dict(schedule.to_dict())
+    assert again.scheduled == ("valve",)
+    assert np.array_equal(again.coefficients, schedule.coefficients)
+
+
 @pytest.fixture(scope="module")
 def model():
-    return identify_step_response()
+    return identify_step_response(WellPlant())
 
 
 @pytest.fixture(scope="module")
 def sweep():
-    return steady_sweep()
+    return steady_sweep(WellPlant(), SWEEP)
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +207,7 @@ def test_model_carries_units_working_point_plant_and_date(model, tmp_path):
 
 def test_settled_and_unsettled_responses_are_told_apart(model):
     assert settling_notes(model) == []
-    short = identify_step_response(samples=30)
+    short = identify_step_response(WellPlant(), samples=30)
     facts = dict(short.provenance)
     assert facts["settled"] is False
     assert "oil_rate after a step of gas_lift had not settled by sample 30" in " ".join(facts["notes"])
@@ -97,8 +216,8 @@ def test_settled_and_unsettled_responses_are_told_apart(model):
 
 
 def test_model_does_not_depend_on_the_step_size_of_a_linear_plant():
-    small = identify_step_response(steps=(0.01, 1.0), samples=60)
-    smaller = identify_step_response(steps=(0.005, 0.5), samples=60)
+    small = identify_step_response(WellPlant(), steps=(0.01, 1.0), samples=60)
+    smaller = identify_step_response(WellPlant(), steps=(0.005, 0.5), samples=60)
     scale = np.abs(small.coefficients).max(axis=-1, keepdims=True)
     assert (np.abs(small.coefficients - smaller.coefficients) / scale).max() < 1e-3
 
@@ -106,18 +225,27 @@ def test_model_does_not_depend_on_the_step_size_of_a_linear_plant():
 @pytest.mark.parametrize(
     ("arguments", "field"),
     [
-        ({"choke": 99.0}, "choke"),
-        ({"lift": -1.0}, "gas_lift"),
+        ({"working_point": (99.0, 7500.0)}, "choke"),
+        ({"working_point": (50.0, -1.0)}, "gas_lift"),
+        ({"working_point": {"choke": 50.0}}, "working_point"),
+        ({"working_point": (1.0, 7500.0), "both_ways": True}, "choke"),
         ({"samples": 0}, "samples"),
-        ({"steps": (0.0, 100.0)}, "steps"),
-        ({"steps": (2.0, float("nan"))}, "steps"),
+        ({"steps": (0.0, 100.0)}, "steps.choke"),
+        ({"steps": (2.0, float("nan"))}, "steps.gas_lift"),
         ({"steps": 2.0}, "steps"),
-        ({"plant": WellPlant(actuator="step"), "steps": (1.0, 100.0), "samples": 5}, "steps[0]"),
+        ({"plant": WellPlant(actuator="step"), "steps": (1.0, 100.0), "samples": 5}, "steps.choke"),
+        ({"disturbance_steps": {"rain": 1.0}}, "disturbance_steps.rain"),
+        (
+            {"disturbance_steps": {"reservoir_pressure_offset": 0.0}},
+            "disturbance_steps.reservoir_pressure_offset",
+        ),
+        ({"plant": Tanks()}, "signals"),
+        ({"plant": Tanks(), "signals": TANKS}, "steps"),
     ],
 )
 def test_bad_step_tests_are_refused_by_name(arguments, field):
     with pytest.raises(InputError) as caught:
-        identify_step_response(**arguments)
+        identify_step_response(**({"plant": WellPlant()} | arguments))
     assert caught.value.field == field
 
 
@@ -131,36 +259,37 @@ def test_gains_fall_as_the_choke_opens_at_every_lift(sweep):
     assert sweep.coefficient.shape == (2, 3, 49)
     assert (np.diff(sweep.coefficient, axis=-1)[..., 1:] < 0).all()
     for lift in range(3):
-        oil = dict(zip(sweep.choke, sweep.coefficient[1, lift], strict=False))
+        oil = dict(zip(sweep.grid["choke"], sweep.coefficient[1, lift], strict=False))
         assert 4 <= oil[10.0] / oil[50.0] <= 9
         assert oil[98.0] <= 0.35 * oil[50.0]
 
 
 def test_sweep_on_the_fmu_agrees(fmu):
-    chokes, lifts = [4.0, 20.0, 50.0, 52.0, 98.0], [5000.0, 10000.0]
-    jax_well, other = steady_sweep(None, chokes, lifts), steady_sweep(fmu, chokes, lifts)
+    grid = {"choke": [4.0, 20.0, 50.0, 52.0, 98.0], "gas_lift": [5000.0, 10000.0]}
+    jax_well, other = steady_sweep(WellPlant(), grid), steady_sweep(fmu, grid)
     np.testing.assert_allclose(other.cv, jax_well.cv, rtol=1e-9)
     np.testing.assert_allclose(other.coefficient, jax_well.coefficient, rtol=1e-6)
     assert other.converged.all()
 
 
 def test_sweep_at_the_working_point_equals_the_identified_gain(model, sweep):
-    at = list(sweep.choke).index(50.0)
+    at = list(sweep.grid["choke"]).index(50.0)
     np.testing.assert_allclose(sweep.coefficient[:, 1, at], model.coefficients[:, 0, -1], rtol=2e-3)
 
 
 @pytest.mark.parametrize(
     ("arguments", "field"),
     [
-        ({"chokes": [10.0, 5.0]}, "chokes"),
-        ({"chokes": [50.0]}, "chokes"),
-        ({"chokes": [50.0, 110.0]}, "choke"),
-        ({"lifts": [-1.0]}, "gas_lift"),
+        ({"choke": [10.0, 5.0]}, "grid.choke"),
+        ({"choke": [50.0]}, "grid.choke"),
+        ({"choke": [50.0, 110.0]}, "choke"),
+        ({"gas_lift": [-1.0]}, "gas_lift"),
+        ({"valve": [1.0]}, "grid"),
     ],
 )
 def test_bad_sweeps_are_refused_by_name(arguments, field):
     with pytest.raises(InputError) as caught:
-        steady_sweep(**arguments)
+        steady_sweep(WellPlant(), SWEEP | arguments)
     assert caught.value.field == field
 
 
@@ -245,8 +374,8 @@ def test_fit_to_the_published_responses_agrees_with_the_shipped_well(published, 
     assert np.min(report["r_squared"]) >= 0.985
     for name, value in parameters_to_dict(shipped).items():
         assert parameters_to_dict(fitted)[name] == pytest.approx(value, rel=0.05), name
-    chokes = [4.0, 10.0, 30.0, 50.0, 70.0, 98.0]
-    ours, theirs = steady_sweep(WellPlant(shipped), chokes), steady_sweep(WellPlant(fitted), chokes)
+    grid = SWEEP | {"choke": [4.0, 10.0, 30.0, 50.0, 70.0, 98.0]}
+    ours, theirs = steady_sweep(WellPlant(shipped), grid), steady_sweep(WellPlant(fitted), grid)
     np.testing.assert_allclose(theirs.cv, ours.cv, rtol=0.01)
 
 

@@ -58,7 +58,7 @@ ROW_KEYS = {
 
 @pytest.fixture(scope="module")
 def model():
-    return identify_step_response()
+    return identify_step_response(WellPlant())
 
 
 @pytest.fixture(scope="module")

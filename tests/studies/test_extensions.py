@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from figures.registry import FIGURES
-from identify.schedule import both_ways, identify_schedule
+from identify.schedule import identify_schedule
 from identify.step_test import identify_step_response
 from jaxmpc import status
 from jaxmpc.controller.controller import Controller
@@ -133,7 +133,7 @@ def results(model, tmp_path_factory):
         make_plant=lambda actuator: WellPlant(actuator=actuator),
         plant_facts={"kind": "jax"},
         extra=dict,
-        schedule=identify_schedule(chokes=(20.0, 40.0, 60.0), lifts=(7500.0,)),
+        schedule=identify_schedule(WellPlant(), {"choke": (20.0, 40.0, 60.0), "gas_lift": (7500.0,)}),
         progress=False,
         say=said.append,
     )
@@ -204,28 +204,28 @@ def test_a_scheduled_controller_without_a_schedule_is_refused(model):
 
 
 def test_a_schedule_has_the_mean_of_steps_up_and_down_at_each_point():
-    schedule = identify_schedule(chokes=(9.0, 40.0), lifts=(5000.0, 7500.0))
-    up = identify_step_response(WellPlant(), 9.0, 7500.0, (2.0, 100.0))
-    down = identify_step_response(WellPlant(), 9.0, 7500.0, (-2.0, -100.0))
+    schedule = identify_schedule(WellPlant(), {"choke": (9.0, 40.0), "gas_lift": (5000.0, 7500.0)})
+    up = identify_step_response(WellPlant(), (9.0, 7500.0), (2.0, 100.0))
+    down = identify_step_response(WellPlant(), (9.0, 7500.0), (-2.0, -100.0))
     mean = 0.5 * (up.coefficients + down.coefficients)
     assert np.asarray(schedule.model_at([9.0, 7500.0]).coefficients) == pytest.approx(np.asarray(mean))
     gains = np.asarray(schedule.coefficients)[:, :, 0, 0, -1]
     assert (gains[0] > 4.0 * gains[1]).all()
-    assert dict(both_ways(WellPlant(), 40.0, 7500.0).provenance)["steps"] == (2.0, 100.0, -2.0, -100.0)
+    assert dict(schedule.reference.provenance)["steps"] == (2.0, 100.0, -2.0, -100.0)
 
 
 @pytest.mark.parametrize(
     ("field", "arguments"),
     [
-        ("chokes", {"chokes": ()}),
-        ("lifts", {"lifts": (5000.0, 5000.0)}),
-        ("steps", {"steps": (-2.0, 100.0)}),
-        ("choke", {"chokes": (1.0,)}),
+        ("grid.choke", {"choke": ()}),
+        ("grid.gas_lift", {"gas_lift": (5000.0, 5000.0)}),
+        ("grid", {"valve": (1.0,)}),
+        ("choke", {"choke": (1.0,)}),
     ],
 )
 def test_a_grid_that_cannot_be_identified_is_refused(field, arguments):
     with pytest.raises(InputError) as error:
-        identify_schedule(**({"chokes": (20.0,), "lifts": (7500.0,)} | arguments))
+        identify_schedule(WellPlant(), {"choke": (20.0,), "gas_lift": (7500.0,)} | arguments)
     assert error.value.field == field
 
 

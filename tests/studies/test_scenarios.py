@@ -15,10 +15,11 @@ from jaxmpc.errors import InputError
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.process.reference import Reference
 from jaxmpc.process.well.plant import WellPlant
+from studies import plans
 from studies.definition import comparison as definition
 from studies.run import comparison
 from studies.store.reading import open_results, provenance
-from studies.thesis import catalogue, plans
+from studies.thesis import catalogue
 from studies.thesis.well import WELL
 from tests import studies_synthetic as made
 

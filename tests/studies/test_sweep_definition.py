@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from jaxmpc.errors import InputError
-from jaxmpc.process.well.equations import WellParameters
+from jaxmpc.process.well.plant import WellPlant
 from studies import load
 from studies.definition.estimate import MODEL_SECONDS
+from studies.definition.fields import study_fields
 from studies.definition.models import identify_models
 from studies.definition.sweep import StudyDefinition, load_definition, shipped_studies
 from studies.load import load_study
@@ -156,7 +157,7 @@ BAD_BASE = {
     "a reference of three CVs": (
         {"reference": {"times": [0], "setpoints": [[1, 2, 3]], "duration": 20}},
         "base.reference.setpoints",
-        "gas_rate, oil_rate",
+        "gas_rate [m3/h], oil_rate [m3/h]",
     ),
     "a reference without length": (
         {"reference": {"times": [0], "setpoints": [[1, 2]]}},
@@ -257,7 +258,7 @@ def test_a_scenario_without_settings_is_the_thesis_controller_on_the_shipped_wel
     thesis = WELL.tuning(scenario.structure)
     for name in ("cv_weight", "move_weight", "mean_move_limit", "oscillation_rows", "bias_cutoff", "mv_low"):
         np.testing.assert_array_equal(getattr(scenario.tuning, name), getattr(thesis, name))
-    assert scenario.plant == WellParameters()
+    assert scenario.plant == {}
     assert scenario.model_point == (50.0, 7500.0)
     assert scenario.samples == 7800
     np.testing.assert_array_equal(scenario.reference.setpoints, WELL.reference("thesis").setpoints)
@@ -278,8 +279,7 @@ def test_settings_and_axes_reach_the_typed_objects_in_their_units():
     }
     made = expand(base, [axis("plant_scale.reservoir_pressure", 1, 1.5), axis("model.choke", 20)])
     scenario = made.scenario(1)
-    assert scenario.plant.reservoir_pressure == 1.5 * 78.2901e5
-    assert scenario.plant.productivity == 3e-5
+    assert scenario.plant == {"reservoir_pressure": 1.5 * 78.2901, "productivity": 3.0}
     assert scenario.model_point == (20.0, 7500.0)
     assert scenario.noise is not None
     assert scenario.noise.tolist() == [20, 0]
@@ -288,7 +288,7 @@ def test_settings_and_axes_reach_the_typed_objects_in_their_units():
     assert np.isposinf(scenario.tuning.mv_high[1])
     assert not np.any(scenario.tuning.oscillation_rows)
     assert scenario.disturbance is not None
-    assert scenario.disturbance.tolist() == [0, 0, 0] + [-2] * 7
+    assert scenario.disturbance.tolist() == [[0]] * 3 + [[-2]] * 7
 
 
 def test_lists_and_dwell_reach_the_structure_of_mixed_integer_controllers_and_may_vary():
@@ -315,7 +315,7 @@ def test_the_offset_of_the_one_pressure_step_can_be_an_axis():
     base = {"duration": 50, "disturbance": [{"time": 20, "offset": 1}]}
     made = expand(base, [axis("disturbance.offset", 0, 3)])
     assert made.scenario(0).disturbance is None
-    assert made.scenario(1).disturbance.tolist() == [0, 0, 3, 3, 3]
+    assert made.scenario(1).disturbance[:, 0].tolist() == [0, 0, 3, 3, 3]
 
 
 def test_a_cut_run_has_only_the_setpoints_that_it_reaches():
@@ -511,9 +511,9 @@ def test_the_quick_cut_replaces_what_it_names_and_nothing_else():
     quick = {
         "chunk_size": 3,
         "base": {"duration": 100},
-        "axes": {WEIGHT: {"keep": [2, 0]}, "model.lift": {"count": 2}, "soft": {"values": [True]}},
+        "axes": {WEIGHT: {"keep": [2, 0]}, "model.gas_lift": {"count": 2}, "soft": {"values": [True]}},
     }
-    lift = {"key": "model.lift", "range": {"from": 5000, "to": 9000, "count": 5}}
+    lift = {"key": "model.gas_lift", "range": {"from": 5000, "to": 9000, "count": 5}}
     axes = [axis(WEIGHT, 1, 2, 3), lift, axis("soft", True, False)]
     definition = define({"reference": "quick"}, axes, quick=quick)
     full, cut = load.expand(definition), load.expand(definition, quick=True)
@@ -570,12 +570,13 @@ def test_the_page_of_the_documentation_lists_every_key_with_its_unit():
     text = DOCS.read_text().partition("## `[base]`")[2]
     found = re.findall(r"^\| `([\w.]+)` \| ([^|]*?) ?\|", text, flags=re.M)
     rows = dict(reversed(found))  # the first row of a name is the one of [base]
-    for key, field in FIELDS.items():
+    fields = study_fields(WELL, WellPlant().parameter_table)
+    for key, field in fields.items():
         if key.startswith(("plant_scale.", "disturbance.", "sensor_fault.")):
             continue
         shown = rows[key.removeprefix("plant.")]
         assert shown.strip() == field.unit or key == "blocks"
-    assert set(PLANT_FIELDS) <= set(rows)
+    assert {p.name for p in WellPlant().parameter_table} <= set(rows)
 
 
 def test_the_examples_of_the_documentation_expand():
@@ -593,11 +594,11 @@ def test_the_examples_of_the_documentation_expand():
 def test_models_are_identified_once_per_working_point():
     ticks = []
     points = [(50, 7500.0), (20.0, 7500.0), (50.0, 7500.0)]
-    found = identify_models(points, samples=20, progress=lambda *now: ticks.append(now))
+    found = identify_models(WELL, points, progress=lambda *now: ticks.append(now))
     assert list(found) == [(50.0, 7500.0), (20.0, 7500.0)]
     assert ticks == [(1, 2), (2, 2)]
     for (choke, lift), model in found.items():
-        assert model.samples == 20
+        assert model.samples == 250
         assert dict(model.working_point)["choke"] == choke
         assert dict(model.working_point)["gas_lift"] == lift
     assert not np.array_equal(found[50.0, 7500.0].coefficients, found[20.0, 7500.0].coefficients)
@@ -606,4 +607,4 @@ def test_models_are_identified_once_per_working_point():
 @pytest.mark.parametrize("point", [(99.0, 7500.0), (-1.0, 7500.0), (50.0, -1.0), (50.0, float("nan"))])
 def test_a_working_point_outside_its_range_is_refused_by_name(point):
     with pytest.raises(InputError, match=r"model\.choke = "):
-        identify_models([(50.0, 7500.0), point], samples=5)
+        identify_models(WELL, [(50.0, 7500.0), point])

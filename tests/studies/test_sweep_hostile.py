@@ -61,7 +61,19 @@ NUMBERS = st.one_of(
 WORDS = st.one_of(
     st.text(max_size=8),
     st.sampled_from(
-        [*FIELDS, "", ".", "\x00", "\ud800", "\u202e", "x" * 5000, "tuning", "inf", "list", "normal"]
+        [
+            *study_fields(WELL, WellPlant().parameter_table),
+            "",
+            ".",
+            "\x00",
+            "\ud800",
+            "\u202e",
+            "x" * 5000,
+            "tuning",
+            "inf",
+            "list",
+            "normal",
+        ]
     ),
 )
 LEAVES = st.one_of(st.none(), st.booleans(), NUMBERS, WORDS)
@@ -167,7 +179,7 @@ LARGE = {
     "combinations": RANGE.format(10**5)
     + RANGE.format(10**5).replace("move_weight.choke", "move_weight.gas_lift"),
     "draws": f'[sampling]\nmethod = "sobol"\ncount = {10**12}\n{DRAWS}',
-    "batches": f'[search]\nobjectives = ["choke_travel"]\nbatches = {10**12}\n{DRAWS}',
+    "batches": f'[search]\nobjectives = ["travel.choke"]\nbatches = {10**12}\n{DRAWS}',
     "digits": RANGE.format("9" * 5000),
     "a horizon": f"[base]\nprediction_horizon = {10**12}\n{RANGE.format(2)}",
     "a block": f"[base]\nblocks = [{10**9}]\nprediction_horizon = {10**9}\n{RANGE.format(2)}",

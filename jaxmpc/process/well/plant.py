@@ -25,16 +25,22 @@ from jaxmpc.errors import InputError
 from jaxmpc.process import integration
 from jaxmpc.process.actuator import Actuator
 from jaxmpc.process.integration import settle, whole_steps
-from jaxmpc.process.plant import JaxPlant, Parameter, checked_parameters
+from jaxmpc.process.plant import JaxPlant, Parameter, Signals, Steady, checked_parameters
 from jaxmpc.process.well.choke import CHOKES, LIFT, check_choke, kind_of
 from jaxmpc.process.well.equations import (
+    CV_NAMES,
+    CV_UNITS,
     DEFAULT_CHOKE,
     DEFAULT_LIFT,
+    MV_NAMES,
+    MV_UNITS,
     SHIPPED_STEADY_STATE,
     WellParameters,
     check_parameters,
     model,
+    well_hash,
 )
+from jaxmpc.process.well.grids import TEST_STEPS
 from jaxmpc.process.well.parameters import PARAMETERS, in_si
 
 # Typical sizes of the states, for tolerances [kg, kg, kg, kg, kg, 1, m3/h, Pa].
@@ -176,6 +182,8 @@ class WellPlant(JaxPlant):
 
     disturbance_names: ClassVar[tuple[str, ...]] = ("reservoir_pressure_offset",)
     parameter_table: ClassVar[tuple[Parameter, ...]] = PARAMETERS
+    signals: ClassVar[Signals] = Signals(CV_NAMES, MV_NAMES, CV_UNITS, MV_UNITS, ("bar",))
+    test_steps: ClassVar[tuple[float, ...]] = TEST_STEPS
     parameters: WellParameters = WellParameters()
     dt: float = eqx.field(static=True, default=10.0)
     substep: float = eqx.field(static=True, default=1.0)
@@ -200,6 +208,21 @@ class WellPlant(JaxPlant):
     def steps(self) -> int:
         """Number of integration steps in one sample."""
         return round(self.dt / self.substep)
+
+    def facts(self) -> dict[str, str]:
+        """What the plant is, with a digest of its parameters."""
+        return {"kind": "jax", "hash": well_hash(self.parameters)}
+
+    @staticmethod
+    def check_mv(mv) -> None:
+        """Refuse a choke [%] or a lift [m3/h] outside its range, each a number or an array."""
+        check_inputs(*mv)
+
+    def steady(self, mv: Any, disturbance: ArrayLike = 0.0) -> Steady:
+        """The steady state of a held choke [%] and lift [m3/h]; as `steady_state`, pure and never raising."""
+        found = steady_state_of(mv[0], mv[1], jnp.reshape(disturbance, ()), self.parameters)
+        position, lift = (jnp.asarray(value, dtype=jnp.float64) for value in mv)
+        return Steady(WellState(found.x, position, lift), found.outputs, found.converged)
 
     def init(self, choke=DEFAULT_CHOKE, lift=DEFAULT_LIFT, disturbance=0.0) -> WellState:
         """Steady state at the given inputs; the stored one for the shipped well at its working point.

@@ -3,7 +3,7 @@
 `fit_well` adjusts the uncertain parameters until the model's own step responses, simulated with the plant's
 Runge-Kutta steps, match given ones. The least-squares Jacobian is the exact derivative of that simulation.
 Step responses at one working point do not determine every parameter, so each keeps to a prior, the shipped
-well, within its uncertainty. Run ``python -m identify.fit DATA.json --out WELL.json``.
+well, within its uncertainty. Run ``python -m identify.well_fit DATA.json --out WELL.json``.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from jaxmpc.process.well.equations import (
     parameters_to_dict,
     save_parameters,
 )
+from jaxmpc.process.well.grids import TEST_STEPS
 from jaxmpc.process.well.plant import STATE_SCALE, JaxOps, check_inputs, rates, runge_kutta, steady_state
 
-STEPS = (2.0, 100.0)  # choke [%] and lift [m3/h], as in the thesis
 RESPONSE_ERROR = 0.05  # standard error of a response, as a share of its peak: the model's, not the data's
 RESPONSE_COUNT = 10.0  # independent values that one response is worth
 RATE_ERROR = 0.01  # relative standard error of the steady rates at the working point
@@ -144,7 +144,7 @@ def load_step_data(path: str | Path) -> StepData:
             raise InputError(f"data.{key}", list(names), f"two names that start with {' and '.join(starts)}")
     choke, lift = point.get("choke", DEFAULT_CHOKE), point.get("gas_lift", DEFAULT_LIFT)
     check_inputs(choke, lift)
-    check_inputs(choke + STEPS[0], lift + STEPS[1])
+    check_inputs(choke + TEST_STEPS[0], lift + TEST_STEPS[1])
     said = [point.get(name) for name in CV_NAMES]
     measured = None if None in said else np.array(said, dtype=np.float64)
     if measured is not None and not (np.isfinite(measured).all() and (measured > 0).all()):
@@ -198,7 +198,7 @@ def simulate_steps(parameters: WellParameters, x0, point, seconds: int, samples:
         _, cv = jax.lax.scan(sample, start, length=samples)
         return ((cv - steady) / jnp.sum(change)).T
 
-    changes = jnp.array([[STEPS[0], 0.0, 0.0], [0.0, STEPS[1], 0.0]])
+    changes = jnp.array([[TEST_STEPS[0], 0.0, 0.0], [0.0, TEST_STEPS[1], 0.0]])
     return steady, jax.vmap(response, out_axes=1)(changes)
 
 
@@ -275,7 +275,7 @@ def fit_well(data: StepData, prior: WellParameters | None = None, steps: int = 3
 def main(arguments: list[str] | None = None) -> int:
     """Command line: fit the well to a file of step responses and write its parameters. Returns 0, or 2."""
     text = "Fit the well to step responses."
-    parser = argparse.ArgumentParser(prog="python -m identify.fit", description=text)
+    parser = argparse.ArgumentParser(prog="python -m identify.well_fit", description=text)
     for name, kind, what in (
         ("data", str, "step responses: a model of `jaxmpc identify`, or a published table (JSON)"),
         ("--out", str, "where to write the parameters (JSON); printed by default"),
