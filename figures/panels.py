@@ -55,7 +55,7 @@ def run_colours(data: xr.Dataset) -> dict[str, str]:
             out[name] = colour
     for i, name in enumerate(name for name in names if name not in out):
         out[name] = style.SPARE_COLOURS[i % len(style.SPARE_COLOURS)]
-    return out
+    return {name: out[name] for name in names}
 
 
 def cv_names(data: xr.Dataset) -> list[str]:
@@ -265,7 +265,7 @@ def shared_legend(
     columns: int | None = None,
     **options: Any,
 ) -> None:
-    """One legend for all panels, in one row or some columns; the deadzone, which differs from CV to CV, without its width."""
+    """One legend for all panels, in a row or some columns; the deadzone, which differs from CV to CV, without its width."""
     found: dict[str, Any] = {}
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):

@@ -14,6 +14,7 @@ from figures import style
 from figures.comparison import overview, tracking, wear
 from figures.comparison import summary as comparison_summary
 from figures.figure import FigureEntry
+from figures.page import write_page
 from figures.thesis import (
     coefficients,
     events,
@@ -31,6 +32,7 @@ from figures.thesis import (
 )
 from jaxmpc.errors import InputError
 from studies.kpi.evaluate import completed
+from studies.store.process import process_in
 from studies.store.reading import open_results
 
 _NUMBERED = (integer_example, coefficients, soft, runs, plans, open_loop, events, solve_time)
@@ -90,7 +92,7 @@ def draw(ids: Iterable[str], results: str | Path | xr.Dataset | None, out: str |
 
 
 def draw_study(folder: str | Path, kind: str) -> list[Path]:
-    """Draw every figure of a comparison into the ``figures`` folder of its folder.
+    """Draw every figure of a comparison into the ``figures`` folder of its folder, and all on one page there.
 
     Args:
         folder: of its results.
@@ -103,10 +105,15 @@ def draw_study(folder: str | Path, kind: str) -> list[Path]:
     Raises:
         InputError: if no run of it is finished, or not one that a figure needs.
     """
-    entries = [entry for entry in FIGURES.values() if entry.study == kind]
-    data = open_results(folder).load()
+    data, out = open_results(folder).load(), Path(folder) / "figures"
+    entries = [entry for entry in FIGURES.values() if entry.study == kind] or comparison_figures(data)
     _check_finished(entries, data)
-    return _drawn(entries or comparison_figures(data), data, Path(folder) / "figures")
+    shown = [(entry, data) for entry in entries]
+    title, process = str(data.attrs.get("title", "")), process_in(data)
+    return [
+        *_drawn(entries, data, out),
+        write_page(shown, out, title, f"{process.title}: every run of one comparison."),
+    ]
 
 
 def comparison_figures(data: xr.Dataset) -> list[FigureEntry]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from typing import Any
 
 import xarray as xr
 from matplotlib.axes import Axes
@@ -65,7 +66,7 @@ def table(page: Axes, data: xr.Dataset, figures: xr.Dataset) -> float:
     heads = [wrapped(str(label), wide, BOLD) for label in figures.label.values]
     y -= 0.5 + LINE * max(map(len, heads))
     for x, name, lines in zip(places, figures.controller.values, heads, strict=True):
-        look = {"color": colours[str(name)], "weight": "bold", "va": "bottom"}
+        look: dict[str, Any] = {"color": colours[str(name)], "weight": "bold", "va": "bottom"}
         page.text(x, y + 0.06, "\n".join(lines), fontsize=9, **look)
     page.plot([LEFT, RIGHT], [y, y], **RULED)
     for i, (what, values) in enumerate(summary_table(data, figures)):

@@ -6,9 +6,20 @@ import numpy as np
 import xarray as xr
 
 from studies.kpi import loop as kpi
+from studies.thesis.catalogue import PLANTS
 from studies.thesis.well import CHOKE, GAS, OIL
 
 LATE = 600.0  # s at the end of a stretch that stand for what it settles at
+
+
+def about(quick: bool, plant: str) -> str:
+    """What the figures of the thesis are of, for a page with all of them."""
+    length = "shortened studies" if quick else "full studies"
+    well = "an FMU of the well" if plant == PLANTS[0] else "the JAX twin of the well"
+    return (
+        "Model predictive control with a discrete choke on a gas-lifted oil well: the figures of the thesis, drawn from "
+        f"our own runs ({length}, {well})."
+    )
 
 
 def oil_first(data: xr.Dataset) -> xr.Dataset:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from figures import gallery, produce, registry, style
+from figures.page import heading
 from figures.thesis import events, integer_example, plans, soft
 from jaxmpc.errors import InputError
 from jaxmpc.loop.trajectory import Trajectory
@@ -472,7 +473,7 @@ def test_the_page_names_every_figure_with_its_study_function_and_command(page):
     targets = [attrs["href"][1:] for attrs in read.of("a")]
     assert set(targets) <= anchors
     for entry in registry.FIGURES.values():
-        assert text.count(gallery.heading(entry)) == 2  # contents and section
+        assert text.count(heading(entry)) == 2  # contents and section
         assert f"figure-{entry.id}" in targets
         assert entry.source in text
         assert f"jaxmpc figures {entry.id}" + (" --quick --plant jax" if entry.study else "") in text, (
