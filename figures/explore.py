@@ -29,6 +29,7 @@ ZOOM = "zoom"  # name of the selection of the time axis
 BEFORE = 60  # samples of the past beside a plan
 CAPTION = "Setpoint dashed, deadzone grey, demands of stepped MVs dotted. Drag over the strip at the bottom to zoom."
 LEFT = 52  # pixels for the numbers of a vertical axis: panels below each other line up
+SCHEMA = "https://vega.github.io/schema/vega-lite/v6.json"
 FONT = "system-ui, sans-serif"
 PLAN = {  # colour and dashes of what is beside a plan
     "setpoint": ("black", [5, 3]),
@@ -238,7 +239,7 @@ def _time(unit: str | None, *, labels: bool = True, domain: Any = None, axis: Sp
 
 
 def _value(name: str) -> Spec:
-    axis = {"minExtent": LEFT, "tickCount": 4}
+    axis = {"minExtent": LEFT, "tickCount": 4, "format": ",.6~g"}
     return {"field": name, "type": "quantitative", "title": None, "scale": {"zero": False}, "axis": axis}
 
 
@@ -250,7 +251,7 @@ def _panel(title: str, layers: list[Spec], width: int, height: int) -> Spec:
 def _chart(rows: Iterable[Spec]) -> Spec:
     """Rows below each other, with the fonts and lines of every chart of the app."""
     return {
-        "$schema": "https://vega.github.io/schema/vega-lite/v6.json",
+        "$schema": SCHEMA,
         "vconcat": list(rows),
         "spacing": 6,
         "usermeta": {"embedOptions": {"renderer": "svg", "actions": False}},

@@ -368,7 +368,7 @@ def test_the_plan_of_a_time_is_drawn_from_that_time_on(mixed):
 
 
 def test_the_runs_of_a_sweep_become_points_with_what_varies_and_the_front(sweep):
-    table = choose.points(sweep)
+    table = choose.points(sweep).table
     expected = numbers(4)
     np.testing.assert_allclose(table[choose.X], expected["travel"][:, 0])
     zones = (1000.0, 5.0)
@@ -376,6 +376,41 @@ def test_the_runs_of_a_sweep_become_points_with_what_varies_and_the_front(sweep)
     assert table["number"].tolist() == [0, 1, 2, 3]
     assert table["best"][int(np.argmin(table[choose.X]))] == "on the front"
     assert all("250" in text for text in table["run"][1::2])
+
+
+def test_ranges_that_are_dragged_keep_the_runs_within_all_of_them(sweep):
+    runs = choose.points(sweep)
+    zone, weight = runs.axes
+    selected = {"axis": [zone, weight], "position": [1.05, 0.6]}
+    assert choose.within(runs, choose.conditions(selected)).tolist() == [False, False, False, True]
+    (low, *_) = choose.conditions({"axis": [weight], "position": [-0.1, 0.3]})
+    assert choose.within(runs, [low]).tolist() == [True, False, True, False]
+    assert choose.in_words(runs, low) == f"{weight}: 62.5 1/%²"
+    for nothing in (None, {}, {"axis": [], "position": []}):
+        assert choose.within(runs, choose.conditions(nothing)).all()
+    travel = runs.table[choose.X].to_numpy()
+    half = choose.Condition(runs.titles[choose.X], -1.0, 0.5)
+    assert (choose.within(runs, [half]) == (travel <= (travel.min() + travel.max()) / 2)).all()
+    lines = choose.parallel(runs, choose.within(runs, [half]))["layer"][0]["data"]["values"]
+    assert len(lines) == 4 * 4  # runs and axes, travel and deviation among these
+
+
+def test_an_axis_is_as_important_as_the_variance_that_it_explains(tmp_path):
+    values = grid([1.0, 2.0, 3.0], [10.0, 20.0], [0, 1, 2, 3])
+    noise = np.random.default_rng(5).normal(size=24)
+    made = numbers(24)
+    made["travel"][:, 0] = 100 * np.array(values[0])
+    made["mean_absolute_deviation"][:] = (50 * np.array(values[1]) + noise)[:, None] * (1.0, 0.0)
+    keys = (DEADZONE, WEIGHT, ("seed", "seed of the noise", "1"))
+    shares = choose.importance(choose.points(write(tmp_path / "made.zarr", keys, values, made)))
+    of = {(row.axis, row.figure): row.share for row in shares.itertuples()}
+    zone, weight, seed = dict.fromkeys(shares["axis"])
+    travel, away = dict.fromkeys(shares["figure"])
+    assert of[zone, travel] == 1
+    assert of[weight, travel] == of[seed, travel] == of[zone, away] == 0
+    groups = (50 * np.array(values[1]) + noise).reshape(3, 2, 4).transpose(1, 0, 2).reshape(2, 12)
+    left, total = groups.var(axis=1, ddof=1).mean(), groups.var(ddof=1)
+    assert of[weight, away] == pytest.approx(1 - left / total)
 
 
 def test_a_stored_scenario_is_drawn_as_it_is_stored(sweep):
@@ -390,8 +425,7 @@ def test_a_stored_scenario_is_drawn_as_it_is_stored(sweep):
 
 def test_the_controllers_of_a_comparison_become_points_too(tmp_path):
     studies_synthetic.stored(tmp_path)
-    table = choose.points(tmp_path)
-    assert len(table) == 3
+    assert len(choose.points(tmp_path).table) == 3
     data = choose.stored(tmp_path, 1)
     assert data.controller.values.tolist() == [RUN]
     assert draw.tracking([draw.Shown("1", draw.COLOURS[0], data)])["vconcat"]
@@ -788,7 +822,9 @@ class Page:
         return self.script(CHARTS)
 
     def complaints(self):
-        return "\n".join(e["message"] for e in self.driver.get_log("browser") if e["level"] == "SEVERE")
+        said = [e["message"] for e in self.driver.get_log("browser") if e["level"] == "SEVERE"]
+        # of the frame of the page, which may draw its sidebar a moment before it knows of it
+        return "\n".join(message for message in said if "handleFillUpdated" not in message)
 
     def move_slider(self, label, key):
         thumb = self.script(
