@@ -220,6 +220,19 @@ def test_plans_of_blocks_of_their_own_are_expanded_for_each_mv(explored):
     np.testing.assert_allclose(plan.move[:, 1], np.repeat(made[:3, 1], blocks[1]))
 
 
+def test_a_plan_knows_what_a_measured_disturbance_will_do(explored):
+    steps = [{"time": 50.0, "offset": 2.0, "name": "ambient"}, {"time": 100.0, "offset": -1.0, "name": "ambient"}]
+    held = nested({f"tuning.move_weight.{mv}": 1e9 for mv in ("feed", "steam")})
+    still = {"times": [0.0], "setpoints": [[0.0, 0.0]], "duration": 900.0}
+    done = run(explored, SHAPE | held | {"controller": "continuous", "disturbance": steps, "reference": still})
+    for sample in (10, 15, 20, 30):  # the model is the plant, and nothing moves: it comes as it was predicted
+        plan = plan_at(done.data, RUN, 5.0 * sample)
+        later = done.trajectory.cv[sample + 1 : sample + 41]
+        known = later if sample >= 20 else later[: 20 - sample]  # until the next step of the disturbance
+        np.testing.assert_allclose(plan.cv[: len(known)], known, atol=1e-3)
+    assert np.abs(done.trajectory.cv).max() > 0.3
+
+
 @pytest.mark.parametrize("kind", ["continuous", "mixed-integer"])
 @pytest.mark.usefixtures("continuous", "mixed")
 def test_other_numbers_compile_nothing_again(kind, explored):
