@@ -347,6 +347,7 @@ def _(controls, export, get_pins, mo, page, run):
                 "runs.html",
                 "text/html",
                 label="Page of these runs",
+                disabled=not draw.can_be_sent(),
             ),
         ]
         shown = mo.accordion(
