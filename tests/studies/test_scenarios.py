@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from identify.plants import open_plant
 from identify.step_test import identify_step_response
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.plan import Planner
@@ -180,7 +181,7 @@ def test_a_scenario_that_cannot_be_run_is_refused_by_its_path(controller, field)
         (((-1.0, 1.0),), "disturbance[0][0]"),
         (((4000.0, 1.0),), "disturbance[0][0]"),
         (((10.0, 1.0), (10.0, 2.0)), "disturbance[1][0]"),
-        (((10.0, np.inf),), "disturbance[0][1]"),
+        (((10.0, np.inf),), "disturbance[0]"),
     ],
 )
 def test_a_disturbance_that_does_not_fit_is_refused_by_its_path(rows, field):
@@ -191,7 +192,7 @@ def test_a_disturbance_that_does_not_fit_is_refused_by_its_path(rows, field):
 
 def test_a_disturbance_holds_until_the_next():
     offsets = made.definition(disturbance=((15.0, -3.0), (40.0, 1.0))).offsets(WELL)
-    assert offsets[:6].tolist() == [0, 0, -3, -3, 1, 1]
+    assert offsets[:6, 0].tolist() == [0, 0, -3, -3, 1, 1]
     assert not made.definition().offsets(WELL).any()
 
 
@@ -259,9 +260,10 @@ def planned(model, tmp_path_factory):
     )
     folder = comparison.run_comparison(
         study,
+        WELL,
         tmp_path_factory.mktemp("planned"),
         model=model,
-        make_plant=lambda actuator: WellPlant(actuator=actuator),
+        make_plant=lambda actual: open_plant(WELL, "jax", actual=actual),
         plant_facts={"kind": "jax"},
         extra=dict,
         progress=False,
@@ -303,8 +305,8 @@ def test_what_a_plan_is_read_with_is_stored(planned):
     study, data = planned
     assert data.block_length.values[0].sum() == 200
     assert data.blocking.values.tolist() == ["moves", "inputs"] * 2
-    assert data.disturbance.values[[9, 10]].tolist() == [0.0, -2.0]
-    assert data.disturbance.attrs["units"] == "bar"
+    assert data.disturbance.values[[9, 10], 0].tolist() == [0.0, -2.0]
+    assert data.disturbance_name.values.tolist() == ["reservoir_pressure_offset"]
     assert data.plan.dims == ("controller", "time", "block", "mv")
     blocks = [len(structure["blocks"]) for structure in provenance(data, "structures")]
     assert blocks == [16] * len(study.controllers)
@@ -353,6 +355,7 @@ def test_a_study_takes_finished_runs_over_from_another(tmp_path, monkeypatch):
     def study(name, controllers):
         return comparison.run_comparison(
             made.definition(name=name, controllers=controllers),
+            WELL,
             tmp_path / name,
             model=made.model(),
             make_plant=lambda actuator: None,
