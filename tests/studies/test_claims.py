@@ -512,18 +512,14 @@ def test_steps_are_timed_once_and_then_read_from_a_file(tmp_path, monkeypatch):
         claims_study, "step_times", lambda *given: calls.append(given[1]) or np.array([1e-3, 2e-3])
     )
     for _ in range(2):
-        clock = claims_study._Clock(
-            Comparison("made-up", study, WELL), tmp_path, tmp_path / "times.json", False, lambda line: None
-        )
+        clock = claims_study._Clock(made_up, tmp_path, tmp_path / "times.json", False, lambda line: None)
         assert clock("continuous-choke").tolist() == [1e-3, 2e-3]
     assert calls == ["continuous-choke"]
     assert json.loads((tmp_path / "times.json").read_text()) == {"key": [1e-3, 2e-3]}
     for damage in ('{"key": [1e-3, 2e', "", "[]", '{"key": ["soon"]}', '{"key": null}'):
         (tmp_path / "times.json").write_text(damage)
         said = []
-        clock = claims_study._Clock(
-            Comparison("made-up", study, WELL), tmp_path, tmp_path / "times.json", False, said.append
-        )
+        clock = claims_study._Clock(made_up, tmp_path, tmp_path / "times.json", False, said.append)
         assert clock("continuous-choke").tolist() == [1e-3, 2e-3]
         assert said[0].startswith(f"{tmp_path / 'times.json'} is damaged and is measured anew (")
         assert json.loads((tmp_path / "times.json").read_text()) == {"key": [1e-3, 2e-3]}
