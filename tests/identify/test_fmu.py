@@ -187,9 +187,20 @@ def test_a_plant_that_the_fmu_cannot_be_is_refused_before_anything_of_the_fmu_ru
     assert caught.value.field == field
 
 
-def test_an_array_is_refused_with_its_size(tmp_path):
-    with pytest.raises(InputError, match=r"a variable with one value \(it is an array of 2\)"):
-        FmuPlant(fmus.make_fmu3(tmp_path), ["row"], ["sum"], dt=1.0)
+def test_elements_of_arrays_are_variables_and_whole_arrays_are_none(tmp_path):
+    path = fmus.make_fmu3(tmp_path)
+    start = {"table[1,1]": 10.0, "table[2,3]": 20.0, "row[1]": 0.5}
+    with FmuPlant(
+        path, ["row[2]", "row[1]"], ["table[1,1]", "table[2,3]", "sum"], dt=1.0, start=start
+    ) as plant:
+        assert plant.init().mv.tolist() == [0, 0.5]
+        assert plant.step([3.0, 4.0]).cv.tolist() == [10, 20, 10 + 20 + 3 + 4]
+        assert plant.working_point.tolist() == [0, 0.5]
+    with pytest.raises(InputError, match=r"such as table\[1,1\] \(it is an array of 2 x 3\)"):
+        FmuPlant(path, ["row[1]"], ["table"], dt=1.0)
+    for name in ("row[3]", "row[0]", "row[1,1]", "sum[1]"):
+        with pytest.raises(InputError, match="a variable of the FMU"):
+            FmuPlant(path, ["row[1]"], [name], dt=1.0)
 
 
 @pytest.mark.parametrize(

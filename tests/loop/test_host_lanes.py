@@ -1,5 +1,7 @@
 """Many loops on plants that keep their state: each is the loop of its own, and one that fails ends alone."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from jaxmpc.loop.reference import Reference
@@ -16,6 +18,7 @@ from jaxmpc.loop.simulate import simulate
 from jaxmpc.model.step_response import make_model
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import make_tuning
+from jaxmpc.process.actuator import Actuator
 from tests import fmus
 
 SAMPLES, LANES, TOLD = 30, 5, [True, False, True, False, True]
@@ -132,3 +135,17 @@ def test_a_plant_that_does_not_start_is_a_lane_without_numbers(monkeypatch, stru
     assert list(failures) == [2]
     assert np.isnan(fields["cv"][2]).all()
     assert np.isfinite(fields["cv"][[0, 1, 3, 4]]).all()
+
+
+def test_an_on_off_valve_of_an_fmu_is_an_mv_with_two_values(structure, model, path):
+    valve = dataclasses.replace(structure, mv_names=("b",), prediction_horizon=6, blocks=(1,) * 6)
+    response = make_model(100 * np.asarray(model.coefficients), structure.dt, ["level"], ["b"])
+    limits = {"mv_low": 0.0, "mv_high": 1.0, "move_low": -1.0, "move_high": 1.0}
+    tuning = make_tuning(valve, cv_weight=1.0, move_weight=0.1, **limits)
+    reference = Reference([0.0], [[50.0]], 600.0)
+    on_off = Actuator("on-off", low=0.0, high=1.0)
+    with FmuPlant(path, {"b": on_off}, ["level"], dt=10.0) as plant:
+        run = simulate(Controller(valve, tuning, response), plant, reference)
+    assert set(run.mv[:, 0]) == {0.0, 1.0}
+    np.testing.assert_allclose(run.mv, run.mv_demand, atol=1e-9)
+    assert abs(run.cv[20:].mean() - 50.0) < 3.0
