@@ -20,7 +20,7 @@ from identify.fmu_process import TIME_LIMIT, FmuProcess
 from jaxmpc.check import is_number
 from jaxmpc.errors import InputError, PlantError, near
 from jaxmpc.process.actuator import Actuator
-from jaxmpc.process.plant import Outputs, Signals
+from jaxmpc.process.plant import Outputs, Parameter, Signals, checked_parameters
 
 MvActuator = Actuator | tuple[float, float] | None
 
@@ -273,13 +273,34 @@ class FmuPlant:
 
     # -------------------------------------------------------------------------------------------------- other plants
 
-    def replaced(self, values: Mapping[str, Value]) -> FmuPlant:
-        """The same plant with other start values or parameters, by name; its process starts with its first `init`.
+    @property
+    def parameter_table(self) -> tuple[Parameter, ...]:
+        """What `replaced` takes: the parameters of the FMU that hold one number and have a start value."""
+        found = []
+        for v in self.description.variables.values():
+            default = self._start_values.get(v.name, v.number)
+            if (
+                v.causality == "parameter"
+                and v.settable
+                and v.type in NUMBERS
+                and default is not None
+                and not v.shape
+            ):
+                found.append(Parameter(v.name, v.unit or "1", float(default), v.text, *v.limits))
+        return tuple(found)
+
+    def replaced(self, values: Mapping[str, Any]) -> FmuPlant:
+        """The same plant with other parameters; its process starts with its first `init`.
 
         Raises:
-            InputError: for what is no start value or parameter of the FMU.
+            InputError: at ``plant.NAME`` for a name that is not in `parameter_table`, or a value that cannot be.
         """
-        start = {**(self._arguments["start"] or {}), **values}
+        checked = checked_parameters(self.parameter_table, values)
+        found = {name: self.description.variables[name] for name in checked}
+        new = {
+            name: found[name].exactly(f"plant.{name}", np.asarray(v).tolist()) for name, v in checked.items()
+        }
+        start = {**(self._arguments["start"] or {}), **new}
         return FmuPlant(**(self._arguments | {"start": start, "description": self.description}))
 
     @property

@@ -63,6 +63,10 @@ class FmuVariable:
     def limits(self) -> tuple[float, float]:
         """What it can hold."""
         low, high = -math.inf, math.inf
+        if self.type == "Boolean":
+            low, high = 0, 1
+        if self.type == "Enumeration":
+            low, high = min(self.items.values()), max(self.items.values())
         if self.type in BITS:
             bits, signed = BITS[self.type], not self.type.startswith("U")
             low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)

@@ -96,7 +96,10 @@ def apply_sequence(
             pieces.append((np.asarray(outputs.cv), np.asarray(outputs.mv)))
         cv, mv = (np.concatenate(parts)[: len(demands)] for parts in zip(*pieces, strict=True))
         return cv, mv
-    outputs = [plant.step(demand, off) for demand, off in zip(demands, disturbances, strict=True)]
+    given = (
+        disturbances if hasattr(plant, "disturbance_names") else disturbances[:, 0]
+    )  # a number where it has no names
+    outputs = [plant.step(demand, off) for demand, off in zip(demands, given, strict=True)]
     return np.array([o.cv for o in outputs]), np.array([o.mv for o in outputs])
 
 

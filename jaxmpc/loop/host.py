@@ -68,7 +68,7 @@ def simulate_on_host(
                     arrived, references[k + ahead : k + ahead + future], stands, dvs[k : k + future]
                 )
                 state, info = controller.lanes.decide(state, sample)
-                record = _record(cv, state, info)
+                record = {name: value[0] for name, value in recorded(cv[None], state, info).items()}
                 carried = CarriedOut(controller.structure, record) if k == blind else None
             else:
                 record = carried.record(k - blind, cv)
@@ -85,13 +85,13 @@ def _sample(cv: np.ndarray, setpoint: np.ndarray, mv: np.ndarray, dv: np.ndarray
     return Sample(cv[None], setpoint[None], mv[None], np.zeros((1, len(mv)), dtype=bool), known)
 
 
-def _record(cv: np.ndarray, state: ControllerState, info: StepInfo) -> dict[str, Any]:
-    """What a sample leaves behind, by the names of `Trajectory`."""
+def recorded(cv: np.ndarray, state: ControllerState, info: StepInfo) -> dict[str, np.ndarray]:
+    """What a sample of some lanes leaves behind, by the names of `Trajectory`; `cv` as sensors without fault measure it."""
     found = {f.name: getattr(info, f.name) for f in dataclasses.fields(info) if f.name != "recovering"}
     found |= dict(
         mv_demand=found.pop("mv"), plan=found.pop("moves"), bias=state.bias, bias_raw=state.bias_raw
     )
-    return {"cv": cv} | {name: np.asarray(value)[0] for name, value in found.items()}
+    return {"cv": cv} | {name: np.asarray(value) for name, value in found.items()}
 
 
 @contextlib.contextmanager

@@ -79,8 +79,8 @@ class ModelPlant(JaxPlant):
     ):
         self.dt, self.cv_names, self.mv_names = model.dt, model.cv_names, model.mv_names
         self.dv_names = model.dv_names
-        tables = model.coefficients, model.dv_coefficients
-        self.nominal = self.coefficients = np.concatenate([np.asarray(table) for table in tables], axis=1)
+        tables = np.asarray(model.coefficients), np.asarray(model.dv_coefficients)
+        self.nominal = self.coefficients = np.concatenate(tables, axis=1)
         loads = model.cv_units or ("",) * len(model.cv_names)
         units = (*(model.dv_units or ("",) * len(model.dv_names)), *loads)
         self.signals = Signals(model.cv_names, model.mv_names, model.cv_units, model.mv_units, units)

@@ -8,7 +8,7 @@ Plants list their parameters, and any of these may vary from lane to lane (`lane
 import dataclasses
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import equinox as eqx
 import jax
@@ -116,11 +116,7 @@ class JaxPlant(eqx.Module):
 
     dt: eqx.AbstractVar[float]
     disturbance_names: eqx.AbstractVar[tuple[str, ...]]
-
-    @property
-    def parameter_table(self) -> tuple[Parameter, ...]:
-        """What `replaced` takes."""
-        return ()
+    parameter_table: ClassVar[tuple[Parameter, ...]] = ()  # what `replaced` takes; others may have a property
 
     def replaced(self, values: Mapping[str, ArrayLike]) -> Self:
         """The plant with other parameters, numbers or ``"lane"`` arrays; see `lanes_of_plants` for the latter.

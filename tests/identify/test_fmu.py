@@ -68,6 +68,11 @@ def test_start_values_and_parameters_hold_from_the_first_moment_in_every_run_and
         for _ in range(2):
             assert plant.init().cv.tolist() == [2 * 5100, 7]
             assert plant.step([1.0]).cv.tolist() == pytest.approx([2 * 5101, 7 + (2 * 5101 - 7) / 6])
+        with pytest.raises(InputError, match=r"plant.gain: got 11.0, expected a number from 0 to 10"):
+            plant.replaced({"gain": 11.0})
+        with pytest.raises(InputError, match=r"plant.level: .* a parameter of the plant: gain, bias"):
+            plant.replaced({"level": 1.0})
+        assert [(p.name, p.default) for p in plant.parameter_table] == [("gain", 2.0), ("bias", 0.0)]
         with plant.replaced({"gain": 3.0}) as other, plant.replaced({}) as same:
             assert other.init().cv.tolist() == [3 * 5100, 7]
             assert plant.step([1.0]).cv[0] == 2 * 5101

@@ -1,7 +1,6 @@
 """A step-response model as a plant: it is the controller's prediction, and differs from it as its parameters say."""
 
 import dataclasses
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,15 @@ TO = Reference([0.0, 50.0], [[0.0, 0.0], [400.0, 8.0]], 400.0)
 def fields(thesis_fields):
     """A tuning whose deviations start at 0."""
     return thesis_fields | {"mv_low": -1e3, "cv_low": -1e4, "deadzone": 0.0, "move_weight": 1.0}
+
+
+def with_feed(model):
+    """The model with a measured disturbance that does half of what the choke does."""
+    coefficients = np.asarray(model.coefficients)
+    names = model.cv_names, model.mv_names
+    return make_model(
+        coefficients, model.dt, *names, dv_coefficients=0.5 * coefficients[:, :1], dv_names=["feed"]
+    )
 
 
 def outputs(plant, moves, disturbance: Any = 0.0):
@@ -79,10 +87,7 @@ def test_loads_are_added_to_their_cv_and_leave_nothing_behind(well_like_model):
 
 def test_disturbances_of_the_model_act_through_their_responses(well_like_model):
     table = np.asarray(well_like_model.coefficients)
-    names = [f.name for f in dataclasses.fields(well_like_model)]
-    known: Any = SimpleNamespace(**{name: getattr(well_like_model, name) for name in names})
-    known.dv_names, known.dv_coefficients = ("feed",), 0.5 * table[:, :1]
-    plant = ModelPlant(known)
+    plant = ModelPlant(with_feed(well_like_model))
     assert plant.disturbance_names == ("feed", "output.gas", "output.oil")
     feed = np.random.default_rng(1).normal(size=20)
     found = outputs(plant, np.zeros((20, 2)), np.stack([feed, 0 * feed, 0 * feed], axis=1))
@@ -91,6 +96,19 @@ def test_disturbances_of_the_model_act_through_their_responses(well_like_model):
     none = outputs(plant.replaced({"gain.oil.feed": 0.0}), np.zeros((20, 2)), np.eye(3)[[0] * 20])
     assert none[:, 0].all()
     assert not none[:, 1].any()
+
+
+def test_a_disturbance_that_the_controller_is_told_leaves_no_bias(well_like_model, small_structure, fields):
+    structure, model = small_structure.relaxed(), with_feed(well_like_model)
+    feed = np.zeros((40, 3))
+    feed[5:, 0] = 8.0
+    run = simulate(
+        Controller(structure, make_tuning(structure, **fields), model),
+        ModelPlant(model),
+        TO,
+        disturbance=feed,
+    )
+    assert np.abs(run.bias_raw).max() < 1e-9
 
 
 def test_it_starts_at_the_working_point_or_where_it_is_told(well_like_model):
