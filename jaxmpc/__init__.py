@@ -30,6 +30,7 @@ _watch()
 _HOME_OF = {
     "Controller": "controller.controller",
     "Controllers": "controller.controller",
+    "Event": "loop.events",
     "InputError": "errors",
     "Reference": "loop.reference",
     "SensorFault": "controller.measurement",

@@ -26,10 +26,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxmpc.check import check_keys, is_count, is_number
-from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.build import Scenarios
+from jaxmpc.controller.controller import Batch, Controller
 from jaxmpc.controller.core import ControllerState, Core, Moment, StepInfo
 from jaxmpc.controller.sample import Sample
 from jaxmpc.errors import InputError
@@ -242,7 +243,7 @@ class _Table:
         kept: controllers kept; the one used least recently goes first.
     """
 
-    def __init__(self, controllers: Controllers, schedule: ModelSchedule, spacing: float, kept: int):
+    def __init__(self, controllers: Batch, schedule: ModelSchedule, spacing: float, kept: int):
         if not is_number(spacing) or spacing <= 0:
             raise InputError("spacing", spacing, "a positive distance of models in the table [MV unit]")
         if not is_count(kept):
@@ -252,32 +253,37 @@ class _Table:
         self.scenarios, self.dv_names, self.count = controllers.scenarios, controllers.dv_names, 1
         self.grid = np.array([step or spacing for step in self.structure.steps])
         self.built = 0  # controllers made so far
-        self._table: collections.OrderedDict[tuple[float, ...], Controllers] = collections.OrderedDict()
+        self._table: collections.OrderedDict[tuple[float, ...], Batch] = collections.OrderedDict()
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the table, which is made again when needed."""
         return self.__dict__ | {"_table": collections.OrderedDict()}
 
-    def at(self, mv) -> Controllers:
+    def of(self, scenarios: Scenarios) -> _Table:
+        """As `Batch.of`, with nothing in it yet."""
+        return _Table(self.reference.of(scenarios), self.schedule, self.spacing, self.kept)
+
+    def at(self, mv) -> Batch:
         """The controller for the MVs [MV unit], rounded to the table."""
         point = tuple((np.round(np.asarray(mv) / self.grid) * self.grid).tolist())
         if point not in self._table:
-            own, model = self.reference, self.schedule.model_at(point)
-            options: dict[str, Any] = dict(gap=own.gap, time_limit=own.time_limit, finish=own.finish)
-            self._table[point] = Controllers(self.structure, own.scenarios.tunings, model, **options)
+            there = dataclasses.replace(self.scenarios, models=[self.schedule.model_at(point)])
+            self._table[point] = self.reference.of(there)
             self.built += 1
             if len(self._table) > self.kept:
                 self._table.popitem(last=False)
         self._table.move_to_end(point)
         return self._table[point]
 
-    def decide(self, state: ControllerState, sample: Sample) -> tuple[ControllerState, StepInfo]:
+    def decide(
+        self, state: ControllerState, sample: Sample, off: Bool[np.ndarray, "scenario cv"] | None = None
+    ) -> tuple[ControllerState, StepInfo]:
         """One sample. Its time includes the making of a controller."""
         clock = Clock()
         before = np.where(np.isfinite(sample.mv[0]), sample.mv[0], np.asarray(state.mv)[0])
         controllers = self.at(before)
         made = clock.seconds
-        state, info = controllers.decide(state, sample)
+        state, info = controllers.decide(state, sample, off)
         clock = Clock()
         # moves of the others are too small to matter
         if np.any(info.move[0, list(self.structure.integer_mvs)]):

@@ -1,7 +1,8 @@
 """Closed loops on plants in JAX, many samples in one compiled call: one lane, or many on several cores or devices.
 
 Decision, plant and next sample stay on the device until a sample is met whose whole moves have to be decided on the host.
-One call carries out what was decided there and goes on. `loop.simulate` is the only caller.
+One call carries out what was decided there and goes on. A call ends before the sample of an event, and the next one has the
+changed controllers. `loop.simulate` is the only caller.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from jaxmpc.controller.controller import Batch, considered
 from jaxmpc.controller.core import Moment
 from jaxmpc.controller.measurement import received
 from jaxmpc.controller.sample import Sample
+from jaxmpc.loop.events import Stage, together
+from jaxmpc.problem.tuning import Tuning
 from jaxmpc.programs.clock import Clock
 from jaxmpc.programs.compilation import compiling_for
 from jaxmpc.programs.lanes import Lanes
@@ -68,6 +71,7 @@ def simulate_compiled(
     inputs: Inputs,
     record: Collection[str],
     *,
+    stages: Sequence[Sequence[Stage]] = (),
     real: int | None = None,
     devices: Sequence[Any] = (),
     progress: Callable[[int], None] | None = None,
@@ -77,6 +81,7 @@ def simulate_compiled(
     The samples of a call share its time by the steps of their solves; what the host does is charged to its sample.
 
     Args:
+        stages: of every scenario, where there are events; the controllers are in the first.
         real: number of scenarios that count, the others are copies; all if not given.
         devices: to spread the scenarios over; the default one if not given.
         progress: told how many samples of all scenarios were done, first when everything is compiled; by one thread at a
@@ -87,8 +92,17 @@ def simulate_compiled(
     most = TOGETHER if len(devices) < 2 else -(-count // len(devices))
     parts = parts_of(count, most, cut=len(devices) > 1)
     places = [devices[k % len(devices)] if len(devices) > 1 else None for k in range(len(parts))]
+    held = any(stage.manual.any() for each in stages for stage in each)
     runs = [
-        _Run(controllers.part(part), plants.take(part), inputs.part(part), record, place)
+        _Run(
+            controllers.part(part),
+            plants.take(part),
+            inputs.part(part),
+            record,
+            place,
+            together([stages[k] for k in part]) if stages else [],
+            held,
+        )
         for part, place in zip(parts, places, strict=True)
     ]
     with compiling_for(f"loops of {controllers.size}"):
@@ -116,9 +130,18 @@ class _Run:
     """Loops under way, of scenarios that share every call; arguments as in `simulate_compiled`."""
 
     def __init__(
-        self, controllers: Batch, plants: Lanes, inputs: Inputs, record: Collection[str], place: Any
+        self,
+        controllers: Batch,
+        plants: Lanes,
+        inputs: Inputs,
+        record: Collection[str],
+        place: Any,
+        stages: Sequence[tuple[int, list[Stage]]],
+        held: bool,
     ):
         self.controllers, self.plants, self.record, self.place = controllers, plants, record, place
+        self.stages, self.held = list(stages), held  # `held`: whether an MV is in any run
+        self.tunings: list[Tuning] = []
         self.count, self.samples = controllers.count, inputs.setpoints.shape[1]
         outside = [inputs.setpoints, inputs.errors, inputs.faults, inputs.dv, inputs.disturbance]
         together = np.concatenate(outside, axis=2)
@@ -127,9 +150,24 @@ class _Run:
         )  # samples that a call is told
         # beyond the end the last sample is repeated
         self.inputs = np.concatenate([together, np.repeat(together[:, -1:], self.window, axis=1)], axis=1)
-        leaves, self.form = flattened((controllers.cores, plants))
-        self.leaves = leaves if place is None else jax.device_put(leaves, place)
-        self.told = inputs.told.astype(float)
+        self.told = inputs.told.astype(float)[:, None]
+        self._take(controllers)
+        self._enter(self.stages.pop(0)[1] if self.stages else [])
+
+    def _take(self, controllers: Batch) -> None:
+        """Go on with other controllers."""
+        self.controllers = controllers
+        leaves, self.form = flattened((controllers.cores, self.plants))
+        self.leaves = leaves if self.place is None else jax.device_put(leaves, self.place)
+
+    def _enter(self, stages: list[Stage]) -> None:
+        """Go on as every scenario's stage says."""
+        tunings = [stage.tuning for stage in stages]
+        if self.tunings and any(a is not b for a, b in zip(tunings, self.tunings, strict=True)):
+            self._take(self.controllers.of(self.controllers.scenarios.with_tunings(tunings)))
+        self.tunings = tunings
+        # without an MV that is held in any run, programs know of none
+        self.manual = np.array([stage.manual for stage in stages]) if self.held else np.zeros((self.count, 0))
 
     def start(self) -> Any:
         """The packed `Now` before the first sample."""
@@ -168,7 +206,7 @@ class _Run:
             ``(packed, seen, done, count, decided)``: the sample measured last, fields of what was measured since and of what
             was carried out, how many samples were measured, and whether all scenarios of the last one are decided.
         """
-        settings = np.concatenate([self.controllers.settings, self.told[:, None]], axis=1)
+        settings = np.concatenate([self.controllers.settings, self.told, self.manual], axis=1)
         given = (packed, self.inputs[:, begin : begin + self.window], settings)
         given = given if self.place is None else jax.device_put(given, self.place)
         packed, rows, (count, decided) = _stride(self.leaves, *given, most, self.form, self.of_now)
@@ -182,9 +220,12 @@ class _Run:
         fields: dict[str, np.ndarray] = {}
         done = acted = 0  # only the first call has nothing to carry out
         while done < self.samples and not stopped():
+            if self.stages and self.stages[0][0] == done + acted:
+                self._enter(self.stages.pop(0)[1])
             clock = Clock()
             # the sample after the last is measured, too: nothing else is carried out at the end
-            most = min(self.samples - done + 1 - acted, LONGEST)
+            end = self.stages[0][0] if self.stages else self.samples + 1
+            most = min(end - done - acted, LONGEST)
             packed, seen, doings, count, decided = self.stride(packed, done, most)
             seconds = clock.seconds
             # the first row of what was seen is the sample after the one that was carried out first
@@ -240,7 +281,8 @@ def _stride(leaves, packed, inputs, settings, most, form, of_now: Packing):
     cvs, future, dvs = now.cv.shape[1], now.moment.free_response.shape[1], cores.value.size.dvs
     setpoints, errors, faults = (inputs[..., k * cvs : (k + 1) * cvs] for k in range(3))
     known, disturbance = inputs[..., 3 * cvs : 3 * cvs + dvs], inputs[..., 3 * cvs + dvs :]
-    told, preview = settings[:, 3:] > 0, inputs.shape[1] > LONGEST + 1
+    told, preview = settings[:, 3:4] > 0, inputs.shape[1] > LONGEST + 1
+    none_held = settings.shape[1] == 4
     late = now.decided[0].astype(int)  # measured is sample `late`, then late + 1, ...
 
     def carry_out(now: Now, at) -> tuple[Now, dict[str, Array]]:
@@ -269,7 +311,7 @@ def _stride(leaves, packed, inputs, settings, most, form, of_now: Packing):
                 ahead(setpoints, at + 1 if preview else at, future), (now.cv.shape[0], future, cvs)
             ),
             mv=jnp.where(told, now.mv, jnp.nan),
-            manual=jnp.zeros(now.mv.shape, dtype=bool),
+            manual=jnp.zeros(now.mv.shape, dtype=bool) if none_held else settings[:, 4:] > 0,
             dv=ahead(known, at, future) if dvs else None,
         )
         moment = considered(cores, before, sample, settings[:, :3])
