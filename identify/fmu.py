@@ -1,163 +1,28 @@
-"""The well as an FMU: building it, and running it as a plant (thesis 3.2).
+"""A co-simulation FMU of any process as a plant for closed loops (`jaxmpc.process.plant.StatefulPlant`).
 
-`build_fmu` compiles the generated sources once and keeps the result in a cache that is keyed by content.
-`FmuPlant` steps an FMU, in a process of its own, with the inputs and outputs of the JAX plant. FMPy would
-interpolate continuous inputs between samples; the plant sets them and steps explicitly, which holds them.
+`FmuPlant` maps MVs, CVs and disturbances to variables of the FMU by name, moves the actuators, and steps the FMU in a
+process of its own (`identify.fmu_process`). FMPy's own simulation would interpolate continuous inputs between samples; the
+plant sets them and steps explicitly, which holds them.
 """
 
 from __future__ import annotations
 
-import functools
 import hashlib
-import importlib.util
-import io
-import os
-import platform
-import shutil
-import sys
-import tempfile
-import zipfile
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from identify.fmu_description import NUMBERS, FmuDescription, FmuVariable, Value
 from identify.fmu_process import TIME_LIMIT, FmuProcess
-from identify.fmu_source import MODEL_IDENTIFIER, fmu_files
-from jaxmpc.errors import InputError, MissingToolError
-from jaxmpc.files import write_atomically
-from jaxmpc.process.actuator import check_actuator, move_choke
-from jaxmpc.process.well.equations import (
-    DEFAULT_CHOKE,
-    DEFAULT_LIFT,
-    INPUTS,
-    OUTPUTS,
-    STATES,
-    WellParameters,
-    check_parameters,
-)
-from jaxmpc.process.well.plant import STATE_SCALE, WellOutputs, check_inputs
-from jaxmpc.programs.cache import cache_folder, read_sealed, sealed
-from jaxmpc.programs.interrupts import in_the_end, run_program
+from jaxmpc.check import is_number
+from jaxmpc.errors import InputError, PlantError, near
+from jaxmpc.process.actuator import Actuator
+from jaxmpc.process.plant import Outputs, Parameter, checked_parameters
 
-# No fused multiply-adds: the FMU and the JAX plant then round alike.
-COMPILER_FLAGS = "-O2 -ffp-contract=off -fno-math-errno"
-CACHE_FORMAT = 2  # of the files in the cache: sealed
-STEADY_DRIFT = 1e-12  # scaled drift [1/s] below which `init` stops settling
-STEADY_SAMPLES = 17280  # 48 h
-INPUT_NAMES = tuple(row[0] for row in INPUTS)
-OUTPUT_NAMES = tuple(row[0] for row in OUTPUTS)
-STATE_NAMES = tuple(f"state.{row[0]}" for row in STATES)
-SWITCH = "SepticControl"
-
-
-def build_fmu(
-    fmi: int = 2, out: str | Path | None = None, parameters: WellParameters | None = None, force: bool = False
-) -> Path:
-    """Build the well as an FMI co-simulation FMU for this machine; a second call builds nothing.
-
-    A damaged FMU in the cache is built anew, and standard error says so.
-
-    Args:
-        fmi: 2 or 3, the FMI version.
-        out: where to put the ``.fmu`` (replaced in one go); by default it stays in the cache.
-        parameters: of the well; the shipped ones by default.
-        force: build although the cache has it.
-
-    Returns:
-        Path of the FMU. It contains its C sources.
-
-    Raises:
-        InputError: for an unknown FMI version, a bad parameter, or a folder as `out`.
-        MissingToolError: without a C compiler or cmake, saying what to install.
-    """
-    if isinstance(fmi, bool) or fmi not in (2, 3):
-        raise InputError("fmi", fmi, "2 or 3, the FMI version")
-    if out is not None and (Path(out).is_dir() or Path(out).suffix != ".fmu"):
-        raise InputError("out", str(out), "the path of a file that ends in .fmu")
-    parameters = check_parameters(WellParameters() if parameters is None else parameters)
-    contents, token = fmu_files(fmi, parameters)
-    key = (CACHE_FORMAT, token, sys.platform, platform.machine(), COMPILER_FLAGS)
-    name = f"{MODEL_IDENTIFIER}-fmi{fmi}-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.fmu"
-    cached = cache_folder("fmu") / name
-    content = None if force else read_sealed(cached)
-    if content is None:
-        content = sealed(_compiled(contents))
-        write_atomically(cached, content)
-    return cached if out is None else write_atomically(out, content)
-
-
-def _compiler() -> str | None:
-    """Path of a C compiler, the one of ``$CC`` first."""
-    names = (os.environ.get("CC", ""), "cc", "gcc", "clang", "cl")
-    return next((found for name in names if name and (found := shutil.which(name.split()[0]))), None)
-
-
-def _cmake_options() -> dict[str, str]:
-    options = {
-        "CMAKE_C_FLAGS:STRING": COMPILER_FLAGS,
-        "CMAKE_C_STANDARD_LIBRARIES:STRING": "-lm",
-        # FMPy's project asks for a C++ compiler too and never uses it: any path that needs no check will do.
-        "CMAKE_CXX_COMPILER:FILEPATH": _compiler() or "",
-        "CMAKE_CXX_COMPILER_WORKS:BOOL": "TRUE",
-        "CMAKE_CXX_COMPILER_FORCED:BOOL": "TRUE",
-    }
-    return options if os.name == "posix" else {}
-
-
-def _tools() -> dict[str, str]:
-    """Environment in which cmake and a C compiler are found; cmake's PyPI package serves if PATH has none."""
-    environment = dict(os.environ)
-    missing = []
-    if not shutil.which("cmake"):
-        package = importlib.util.find_spec("cmake")
-        if package and package.origin:
-            folder = str(Path(package.origin).parent / "data" / "bin")
-            environment["PATH"] = folder + os.pathsep + environment.get("PATH", "")
-        if not shutil.which("cmake", path=environment.get("PATH")):
-            missing.append("cmake")
-    if not _compiler():
-        missing.append("a C compiler")
-    if not missing and not shutil.which("make") and not shutil.which("ninja") and os.name == "posix":
-        missing.append("make")
-    if missing:
-        raise MissingToolError(
-            f"Cannot build the FMU: {' and '.join(missing)} not found. On Debian or Ubuntu: "
-            "apt install gcc libc6-dev make (and cmake, or: pip install cmake); on macOS: "
-            "xcode-select --install. The JAX well needs none of this: --plant jax."
-        )
-    return environment
-
-
-def _compiled(contents: dict[str, str]) -> bytes:
-    """Compile the sources in a temporary folder and return the zipped FMU."""
-    environment = _tools()
-    folder = tempfile.mkdtemp(prefix="jaxmpc-fmu-")
-    with in_the_end(functools.partial(shutil.rmtree, folder, ignore_errors=True)):
-        tree, build = Path(folder, "fmu").resolve(), Path(folder, "build").resolve()
-        build.mkdir()
-        for name, content in contents.items():
-            path = tree / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(content)
-        # A process of its own keeps cmake's output and the changed PATH out of this one.
-        code = (
-            "from fmpy.build import build_platform_binary as build; "
-            f"build({str(tree)!r}, {str(build)!r}, cmake_options={_cmake_options()!r})"
-        )
-        command = [sys.executable, "-P", "-c", code]
-        status, said = run_program(command, {**environment, "TMPDIR": str(build)})
-        if status != 0:
-            raise MissingToolError(
-                "Building the FMU failed. A C compiler with its headers is needed (Debian or Ubuntu: "
-                f"apt install gcc libc6-dev make). Its last words:\n{said[-3000:]}"
-            )
-        archive = io.BytesIO()
-        with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as zipped:
-            for path in sorted(p for p in tree.rglob("*") if p.is_file()):
-                # A fixed date keeps equal FMUs equal.
-                zipped.writestr(zipfile.ZipInfo(path.relative_to(tree).as_posix()), path.read_bytes())
-        return archive.getvalue()
+MvActuator = Actuator | tuple[float, float] | None
 
 
 def validate_fmu(path: str | Path) -> list[str]:
@@ -168,147 +33,290 @@ def validate_fmu(path: str | Path) -> list[str]:
 
 
 class FmuPlant:
-    """An FMU of the well, stepped like `jaxmpc.process.well.plant.WellPlant`, with its state in a process of its own.
+    """An FMU as a plant that keeps its state, in a process of its own.
 
     Use it as a context manager, or `close` it; that ends the process and removes the unpacked files. One
-    instance serves any number of runs: `init` resets it.
+    instance serves any number of runs, one at a time: `init` begins a new one.
+
+    Numbers are rounded to whole ones for integers, to the nearest value for enumerations, and are true from 0.5 on for
+    Booleans; they stay within the least and greatest value that the FMU declares.
 
     Args:
-        path: of the FMU; by default the shipped well, built on first use (FMI 2.0).
-        actuator: ``continuous`` or ``step``, see `jaxmpc.process.actuator`.
+        path: of the FMU.
+        mv: names of the MVs, inputs or tunable parameters of the FMU, in order; or by name what moves them: an `Actuator`,
+            limits ``(low, high)`` of the demand [MV unit], or None.
+        cv: names of the CVs, in order.
+        disturbances: names of variables that are disturbed, or their undisturbed values by name; by default those that they
+            start with. The loop gives how far off they are.
         dt: sampling interval [s].
+        start: start values and parameters by name; enumerations by name or value.
+        working_point: of MVs by name, if not their start values.
+        positions: variables by MV that tell where its actuator stands; it is where the demand moves it if not given.
+        substep: step of the FMU [s], a whole number of them in `dt`; by default its own, or that of its default experiment.
+        settle: simulated with the MVs at their working point before `init` returns [s].
+        stop_time: end of the longest run [s], for FMUs that want to know it, settling included.
         time_limit: for one call of the FMU [s].
+        description: of the FMU, if it has been read.
 
     Attributes:
-        token: instantiation token of the FMU, a digest of its contents.
-        fmi: major FMI version.
-        settled: whether the last `init` found a steady state within 48 hours.
+        description: what the FMU says of itself.
+        token: its GUID or instantiation token.
+        fmi: its major FMI version.
+        disturbance_names: variables that are disturbed.
+        working_point: ``"mv"`` [MV unit].
 
     Raises:
-        InputError: for a file that is not an FMU of the well, with the reason.
-        MissingToolError: if it has to be built and cannot.
-        PlantError: if the FMU crashes, hangs or reports an error; so do `init`, `step`, `measure` and `x`.
+        InputError: for a file that is no such FMU, or for variables that it has not, with near names, or that cannot be used
+            in this way, before anything runs.
+        PlantError: if the FMU crashes, hangs, reports an error or gives what is no number; so do `init`, `step`, `measure`.
     """
 
     def __init__(
         self,
-        path: str | Path | None = None,
-        actuator: str = "continuous",
-        dt: float = 10.0,
+        path: str | Path,
+        mv: Sequence[str] | Mapping[str, MvActuator],
+        cv: Sequence[str],
+        disturbances: Sequence[str] | Mapping[str, Value] = (),
+        *,
+        dt: float,
+        start: Mapping[str, Value] | None = None,
+        working_point: Mapping[str, Value] | None = None,
+        positions: Mapping[str, str] | None = None,
+        substep: float | None = None,
+        settle: float = 0.0,
+        stop_time: float | None = None,
         time_limit: float = TIME_LIMIT,
+        description: FmuDescription | None = None,
     ):
-        self.actuator = check_actuator(actuator, "plant.actuator")
-        if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not 0 < dt < np.inf:
-            raise InputError("plant.dt", dt, "a positive number of seconds")
-        self.dt = float(dt)
-        self.path = Path(path) if path is not None else build_fmu()
-        self._fmu = FmuProcess(self.path, time_limit)
-        self.token, self.fmi = self._fmu.token, self._fmu.fmi
+        self._arguments = {
+            name: value for name, value in locals().items() if name not in ("self", "description")
+        }
+        for name, value in (("dt", dt), ("substep", substep), ("stop_time", stop_time)):
+            given = value is not None or name == "dt"
+            if given and not (is_number(value) and value > 0):  # type: ignore[operator]
+                raise InputError(f"plant.{name}", value, "a positive number of seconds")
+        if not is_number(settle) or settle < 0:
+            raise InputError("plant.settle", settle, "a number of seconds, 0 or more")
+        self.path, self.dt, self.time_limit = Path(path), float(dt), time_limit
+        self._stop, self._begun = stop_time, False
+        self._process = FmuProcess(path, time_limit) if description is None else None
         try:
-            self._check_variables()
-            self.init()
+            known = description if self._process is None else self._process.description
+            assert known is not None
+            self.description: FmuDescription = known
+            self.token, self.fmi = self.description.token, self.description.fmi
+            self._check_description()
+            self._substep, self._count = self.description.step_of(self.dt, substep)
+            self._settle = math.ceil(settle / self._substep - 1e-9)
+            self._take_start(start or {})
+            self._take_mvs(mv, working_point or {}, positions or {})
+            self._take_cvs(cv)
+            self._take_disturbances(disturbances)
+            if self._process:
+                self._process.load()
         except BaseException:
-            self._fmu.close()
+            self.close()
             raise
 
-    def _check_variables(self) -> None:
-        """Refuse an FMU of something else."""
-        number = "Float64" if self.fmi == 3 else "Real"
-        wanted = dict.fromkeys((*INPUT_NAMES, *OUTPUT_NAMES, *STATE_NAMES), number) | {SWITCH: "Boolean"}
-        found = {name: kind for name, (kind, _) in self._fmu.variables.items()}
-        missing = [name for name in wanted if name not in found]
-        wrong = [(name, kind) for name, kind in wanted.items() if found.get(name) != kind]
-        if wrong:
-            name, kind = wrong[0]
-            fault = (
-                f"without {', '.join(missing)} it is not"
-                if missing
-                else f"{name} is {found[name]}, not {kind}"
-            )
-            raise InputError("plant.path", str(self.path), f"an FMU of the well ({fault})")
+    # ------------------------------------------------------------------------------------------------ what is given
 
-    def init(
-        self, choke: float = DEFAULT_CHOKE, lift: float = DEFAULT_LIFT, disturbance: float = 0.0, x=None
-    ) -> WellOutputs:
-        """Start a new run in the steady state of the given inputs, and measure.
+    def _check_description(self) -> None:
+        """Refuse an FMU of another process; for plants of a single one."""
 
-        At the working point that is the steady state stored in the FMU; elsewhere the FMU is simulated with
-        held inputs until it has settled, for 48 hours at most.
+    def _take_start(self, start: Mapping[str, Value]) -> None:
+        self._start_values: dict[str, Value] = {}
+        for name, value in start.items():
+            found = self.description.variable("plant.start", name)
+            if not found.settable or found.type not in (*NUMBERS, "String"):
+                expected = f"a start value or a parameter (this is {_kind(found)})"
+                raise InputError("plant.start", name, expected)
+            self._start_values[name] = found.exactly(f"plant.start.{name}", value)
 
-        Args:
-            choke: position [%], 0..100.
-            lift: lift rate [m3/h], 0 or more.
-            disturbance: offset of the reservoir pressure [bar].
-            x: ``"8"``, states to start from instead, in the order and units of `jaxmpc.process.well.equations.STATES`.
+    def _take_mvs(self, mv: Any, working_point: Mapping[str, Value], positions: Mapping[str, str]) -> None:
+        actuators = dict(mv) if isinstance(mv, Mapping) else dict.fromkeys(_names("plant.mv", mv))
+        self.mv_names = tuple(actuators)
+        self._mvs = [self._moved("plant.mv", name) for name in actuators]
+        self._actuators = [_actuator(name, given) for name, given in actuators.items()]
+        for field, given in (("working_point", working_point), ("positions", positions)):
+            for name in given:
+                if name not in actuators:
+                    expected = f"one of the MVs {', '.join(actuators)}"
+                    raise InputError(f"plant.{field}", name, expected, near(name, actuators))
+        self.working_point = np.array(
+            [self._rest("plant.working_point", found, working_point) for found in self._mvs]
+        )
+        self._positions = {
+            self.mv_names.index(name): self._read("plant.positions", told).name
+            for name, told in positions.items()
+        }
 
-        Raises:
-            InputError: for inputs outside their range, or states of the wrong shape or not finite.
-        """
-        check_inputs(choke, lift, disturbance)
-        if x is not None and (np.shape(x) != (len(STATES),) or not np.isfinite(x).all()):
-            raise InputError("x", x, f"{len(STATES)} finite states")
-        inputs = _floats(INPUT_NAMES, (choke, lift, disturbance))
-        self._start(inputs, x)
-        self.settled = True
-        if x is None and (choke, lift, disturbance) != (DEFAULT_CHOKE, DEFAULT_LIFT, 0.0):
-            self._start(inputs, self._settle())  # again, so that time is zero
-        self._position, self._lift = float(choke), float(lift)
+    def _take_cvs(self, cv: Sequence[str]) -> None:
+        self.cv_names = _names("plant.cv", cv)
+        for name in self.cv_names:
+            self._read("plant.cv", name)
+        self._outputs = (*self.cv_names, *self._positions.values())
+
+    def _take_disturbances(self, disturbances: Any) -> None:
+        given = disturbances if isinstance(disturbances, Mapping) else {}
+        self.disturbance_names = _names("plant.disturbances", disturbances)
+        self._disturbed = [self._moved("plant.disturbances", name) for name in self.disturbance_names]
+        twice = set(self.disturbance_names) & set(self.mv_names)
+        if twice:
+            raise InputError("plant.disturbances", min(twice), "a variable that is no MV")
+        self._undisturbed = np.array([self._rest("plant.disturbances", v, given) for v in self._disturbed])
+
+    def _moved(self, field: str, name: str) -> FmuVariable:
+        """A variable that is set while the FMU runs."""
+        found = self.description.variable(field, name)
+        if not found.movable or found.type not in NUMBERS:
+            expected = f"an input or a tunable parameter that holds a number (this is {_kind(found)})"
+            raise InputError(field, name, expected)
+        return found
+
+    def _read(self, field: str, name: str) -> FmuVariable:
+        """A variable that is measured."""
+        found = self.description.variable(field, name)
+        if found.causality not in ("output", "local") or found.type not in NUMBERS:
+            expected = f"an output or a local variable that holds a number (this is {_kind(found)})"
+            raise InputError(field, name, expected)
+        return found
+
+    def _rest(self, field: str, found: FmuVariable, given: Mapping[str, Value]) -> float:
+        """The value of a moved variable at rest: the given one, or that which it starts with."""
+        name = found.name
+        if name in given:
+            return float(found.exactly(f"{field}.{name}", given[name]))
+        value = float(self._start_values[name]) if name in self._start_values else found.number
+        if value is None:
+            raise InputError(f"{field}.{name}", "nothing", f"{found.expected}: the FMU has no start value")
+        return value
+
+    # ------------------------------------------------------------------------------------------------------- a run
+
+    def init(self) -> Any:
+        """Begin a new run with the MVs at their working point, let it settle, and measure."""
+        self._begin(self.working_point, 0.0)
+        if self._settle:
+            self._fmu.step(self._substep, count=self._settle)
         return self.measure()
 
-    reset = init
+    def _begin(self, mv: Any, disturbance: Any, values: Mapping[str, Value] | None = None) -> None:
+        """Begin a new run at time zero with these MVs and disturbances held, and more start values."""
+        if self._process is None or self._process.closed:
+            self._process = FmuProcess(self.path, self.time_limit)
+        self._position, self._begun = np.array(mv, dtype=np.float64), True
+        moved = [v.nearest(x) for v, x in zip(self._mvs, self._position, strict=True)]
+        inputs = self._inputs(moved, disturbance)
+        self._fmu.start(self._start_values | dict(values or {}), inputs, self._stop)
 
-    def _start(self, inputs: dict[str, float], x) -> None:
-        self._fmu.start({} if x is None else _floats(STATE_NAMES, x))
-        # The switch returns to false with every start.
-        self._fmu.set({SWITCH: True, **inputs})
-
-    def _settle(self) -> list[float]:
-        before = self._fmu.get(STATE_NAMES)
-        for _ in range(STEADY_SAMPLES // 60):
-            after = self._fmu.step(self.dt, outputs=STATE_NAMES, count=60)
-            drift = np.max(np.abs(np.subtract(after, before)) / STATE_SCALE)
-            self.settled = bool(drift < STEADY_DRIFT * 60 * self.dt)
-            before = after
-            if self.settled:
-                break
-        return before
-
-    def step(self, mv, disturbance: Any = 0.0) -> WellOutputs:
+    def step(self, mv, disturbance: Any = 0.0) -> Any:
         """One sample: move the actuators, hold the inputs for `dt`, and measure at the end.
 
         Args:
-            mv: choke demand [%] (limited to 0..100 by the choke) and lift demand [m3/h] (0 or more).
-            disturbance: offset of the reservoir pressure during the sample [bar].
+            mv: demands [MV unit].
+            disturbance: how far the disturbed variables are off during the sample, in the order of `disturbance_names`, or
+                one number.
 
         Raises:
-            InputError: for anything but two finite numbers and a finite disturbance; nothing has moved then.
+            InputError: for anything but finite numbers, one per MV and disturbance; nothing has moved then.
         """
         demand = np.asarray(mv, dtype=np.float64)
-        if demand.shape != (2,) or not np.isfinite(demand).all():
-            raise InputError("mv", mv, "choke [%] and lift [m3/h], two finite numbers")
-        offset = float(np.asarray(disturbance, dtype=np.float64).reshape(()))
-        if not np.isfinite(offset):
-            raise InputError("reservoir_pressure_offset", offset, "a finite pressure change [bar]")
-        self._position = float(move_choke(self.actuator, self._position, demand[0]))
-        self._lift = max(float(demand[1]), 0.0)
-        inputs = _floats(INPUT_NAMES, (self._position, self._lift, offset))
-        return self._measured(self._fmu.step(self.dt, inputs, OUTPUT_NAMES))
+        if demand.shape != self.working_point.shape or not np.isfinite(demand).all():
+            units = ", ".join(f"{v.name} [{v.unit}]" if v.unit else v.name for v in self._mvs)
+            raise InputError("mv", mv, f"finite numbers, one per MV: {units}")
+        fmu = self._fmu
+        moves = zip(self._mvs, self._actuators, self._position, demand, strict=True)
+        moved = [v.nearest(one.move(now, to)) for v, one, now, to in moves]
+        inputs = self._inputs(moved, disturbance)
+        self._position = np.array(moved, dtype=np.float64)
+        return self._measured(fmu.step(self._substep, inputs, self._outputs, self._count))
 
-    def measure(self) -> WellOutputs:
+    def _inputs(self, moved: Sequence[Value], disturbance: Any) -> dict[str, Value]:
+        """What is given to the FMU with the actuators at these positions."""
+        given = dict(zip(self.mv_names, moved, strict=True))
+        off = np.asarray(disturbance, dtype=np.float64)
+        if off.shape not in ((), self._undisturbed.shape):
+            expected = f"one number, or one each for {', '.join(self.disturbance_names) or 'no disturbance'}"
+            raise InputError("disturbance", disturbance, expected)
+        values = self._undisturbed + off
+        for v, value in zip(self._disturbed, values.tolist(), strict=True):
+            if not math.isfinite(value):
+                raise InputError(v.name, value, f"a finite change{f' [{v.unit}]' if v.unit else ''}")
+            given[v.name] = v.nearest(value)
+        return given
+
+    def measure(self) -> Any:
         """What the FMU measures now."""
-        return self._measured(self._fmu.get(OUTPUT_NAMES))
+        return self._measured(self._fmu.get(self._outputs))
 
-    def _measured(self, y: list[float]) -> WellOutputs:
-        return WellOutputs(np.array(y[:2]), np.array([self._position, self._lift]), *y[2:])
+    def _measured(self, values: Sequence[Any]) -> Any:
+        """Outputs from the values of `_outputs`."""
+        y = self._numbers(values)
+        mv = self._position.copy()
+        for k, told in zip(self._positions, y[len(self.cv_names) :], strict=True):
+            mv[k] = told
+        return Outputs(y[: len(self.cv_names)], mv)
+
+    def _numbers(self, values: Sequence[Any]) -> np.ndarray:
+        y = np.array(values, dtype=np.float64)
+        if not np.isfinite(y).all():
+            bad = int(np.flatnonzero(~np.isfinite(y))[0])
+            raise PlantError(f"{self.path}: the FMU gives {y[bad]:g} for {self._outputs[bad]}")
+        return y
 
     @property
-    def x(self) -> np.ndarray:
-        """``"8"``, the states in the order and units of `jaxmpc.process.well.equations.STATES`."""
-        return np.array(self._fmu.get(STATE_NAMES))
+    def _fmu(self) -> FmuProcess:
+        """The process, which says itself that it is closed."""
+        if self._process is None or not self._begun:
+            raise InputError("plant", "not started", "a plant after init()")
+        return self._process
+
+    # -------------------------------------------------------------------------------------------------- other plants
+
+    @property
+    def parameter_table(self) -> tuple[Parameter, ...]:
+        """What `replaced` takes: the parameters of the FMU that hold one number and have a start value."""
+        found = []
+        for v in self.description.variables.values():
+            default = self._start_values.get(v.name, v.number)
+            if (
+                v.causality == "parameter"
+                and v.settable
+                and v.type in NUMBERS
+                and default is not None
+                and not v.shape
+            ):
+                found.append(Parameter(v.name, v.unit or "1", float(default), v.text, *v.limits))
+        return tuple(found)
+
+    def replaced(self, values: Mapping[str, Any]) -> FmuPlant:
+        """The same plant with other parameters; its process starts with its first `init`.
+
+        Raises:
+            InputError: at ``plant.NAME`` for a name that is not in `parameter_table`, or a value that cannot be.
+        """
+        checked = checked_parameters(self.parameter_table, values)
+        found = {name: self.description.variables[name] for name in checked}
+        new = {
+            name: found[name].exactly(f"plant.{name}", np.asarray(v).tolist()) for name, v in checked.items()
+        }
+        start = {**(self._arguments["start"] or {}), **new}
+        return FmuPlant(**(self._arguments | {"start": start, "description": self.description}))
+
+    def facts(self) -> dict[str, Any]:
+        """What the plant is, with a digest of everything that decides its responses."""
+        how = (
+            (self.mv_names, self._actuators, self.working_point.tolist(), self._positions),
+            (self.cv_names, self.disturbance_names, self._undisturbed.tolist()),
+            (sorted(self._start_values.items()), self._substep, self._count, self._settle, self._stop),
+        )
+        digest = hashlib.sha256(self.path.read_bytes() + repr(how).encode())
+        return {"kind": "fmu", "hash": digest.hexdigest()[:32], "fmi": self.fmi}
 
     def close(self) -> None:
-        """Free the FMU, end its process, and remove the unpacked files; twice is once."""
-        self._fmu.close()
+        """Free the FMU, end its process, and remove the unpacked files; twice is once. `init` starts another."""
+        if self._process is not None:
+            self._process.close()
 
     def __enter__(self) -> FmuPlant:
         return self
@@ -317,5 +325,33 @@ class FmuPlant:
         self.close()
 
 
-def _floats(names: tuple[str, ...], values) -> dict[str, float]:
-    return {name: float(value) for name, value in zip(names, values, strict=True)}
+def _names(field: str, given: Any) -> tuple[str, ...]:
+    """Names that are given as a list or as keys, each once."""
+    names = () if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
+    empty = not names and field != "plant.disturbances"
+    if (
+        isinstance(given, str)
+        or empty
+        or len(set(names)) != len(names)
+        or not all(isinstance(n, str) for n in names)
+    ):
+        raise InputError(field, given, "names of variables of the FMU, each once")
+    return names
+
+
+def _actuator(name: str, given: MvActuator) -> Actuator:
+    if isinstance(given, Actuator):
+        return given
+    if given is None:
+        return Actuator()
+    if not isinstance(given, (tuple, list)) or len(given) != 2:
+        raise InputError(f"plant.mv.{name}", given, "an Actuator, limits (low, high) [MV unit], or None")
+    try:
+        return Actuator(low=given[0], high=given[1])
+    except (InputError, TypeError):
+        raise InputError(f"plant.mv.{name}", given, "limits (low, high), low below high [MV unit]") from None
+
+
+def _kind(found: FmuVariable) -> str:
+    """In words, what a variable is."""
+    return f"{found.type}, {found.variability} {found.causality}"

@@ -1,7 +1,7 @@
 """An FMU in a process of its own: a crash, an `exit` or a call that never returns ends that process and no more.
 
-`FmuProcess` starts `identify.fmu_worker` and talks to it, in one round trip per sample (about 0.1 ms). It knows nothing of
-the well: `identify.fmu.FmuPlant` is the well on top of it, and a plant of another process is made in the same way.
+`FmuProcess` starts `identify.fmu_worker` and talks to it, in one round trip per sample (about 0.1 ms);
+`identify.fmu.FmuPlant` makes a plant of it.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from identify.fmu_description import FmuDescription, Value
 from identify.fmu_worker import NOTE, NOTE_BYTES, UNPACKED
 from jaxmpc.errors import InputError, PlantError
 from jaxmpc.programs.interrupts import before_leaving
@@ -28,11 +29,9 @@ TIME_LIMIT = 300.0  # s for one call of an FMU
 GOODBYE = 10.0  # s for an FMU to free itself
 WORKER = Path(__file__).with_name("fmu_worker.py")
 
-Value = float | int | bool
-
 
 class FmuProcess:
-    """A co-simulation FMU of FMI 2.0 or 3.0, instantiated in its own process.
+    """An FMU of FMI 2.0 or 3.0 in its own process, which has read its description; `load` it to use it for co-simulation.
 
     Use it as a context manager, or `close` it; that frees the FMU, ends its process and removes the unpacked files.
     The process also ends when this one ends, however that happens.
@@ -44,13 +43,10 @@ class FmuProcess:
     Attributes:
         path, time_limit: as given.
         folder: where the FMU is unpacked, removed by `close`.
-        fmi: major FMI version.
-        token: GUID or instantiation token.
-        variables: type (``Real``, ``Integer``, ``Boolean``, ``Float64``, ...) and causality by name.
+        description: what the FMU says of itself.
 
     Raises:
-        InputError: for a file that is not such an FMU, or not for this machine, with the reason.
-        PlantError: if the FMU crashes or hangs while it is loaded.
+        InputError: for a file that is not such an FMU, with the reason.
     """
 
     def __init__(self, path: str | Path, time_limit: float = TIME_LIMIT):
@@ -81,20 +77,44 @@ class FmuProcess:
         self._finalizer = weakref.finalize(self, _remove, self._process, self._channel, self.folder)
         before_leaving(self._finalizer)
         try:
-            facts = self._ask(load=str(self.path.absolute()))
+            facts = self._ask(describe=str(self.path.absolute()))
+            self.description = FmuDescription.of({k: v for k, v in facts.items() if k != "n"})
         except BaseException:
             self._finalizer()
             raise
-        self.fmi, self.token = facts["fmi"], facts["token"]
-        self.variables = {name: (kind, causality) for name, (kind, causality) in facts["variables"].items()}
+        self._loaded = False
 
-    def start(self, values: Mapping[str, Value] | None = None) -> None:
-        """Begin a new run at time zero, with start values by name.
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed; one whose FMU has taken its process along was not."""
+        return not self._finalizer.alive and not self._failure
+
+    def load(self) -> None:
+        """Load the library of the FMU and instantiate it; twice is once.
 
         Raises:
+            InputError: for an FMU that is not for co-simulation, not for this machine or not what it says it is.
             PlantError: if the FMU fails; so do all methods.
         """
-        self._ask(start=dict(values or {}))
+        if not self._loaded:
+            self._ask(load=True)
+            self._loaded = True
+
+    def start(
+        self,
+        values: Mapping[str, Value] | None = None,
+        inputs: Mapping[str, Value] | None = None,
+        stop: float | None = None,
+    ) -> None:
+        """Begin a new run at time zero, with start values by name.
+
+        Args:
+            values: set before the FMU initialises itself.
+            inputs: set while it does, and held from then on.
+            stop: time that the FMU is told the run will end [s]; by default it is told none.
+        """
+        self.load()
+        self._ask(start=[dict(values or {}), dict(inputs or {}), stop])
 
     def set(self, values: Mapping[str, Value]) -> None:
         """Set variables, by name."""

@@ -76,19 +76,20 @@ def check_archive(path: Path, free: int) -> None:
         raise RefusedError(f"a {DESCRIPTION} of at most {MAX_DESCRIPTION_BYTES} bytes")
 
 
-def unpack(path: Path, folder: Path) -> None:
-    """Unpack a checked archive."""
+def unpack(path: Path, folder: Path, names: list[str] | None = None) -> None:
+    """Unpack a checked archive, or some of its files."""
     try:
         with zipfile.ZipFile(path) as archive:
-            archive.extractall(folder)
+            archive.extractall(folder, names)
     except Exception as error:  # a damaged archive: whatever zipfile and zlib raise
         raise RefusedError(f"an undamaged FMU ({type(error).__name__}: {error})") from None
 
 
-def read_description(folder: Path) -> Any:
-    """FMPy's reading of the model description of a co-simulation FMU of FMI 2.0 or 3.0; refuses other kinds."""
+def read_description(path: Path, folder: Path) -> Any:
+    """FMPy's reading of the model description of an FMU of FMI 2.0 or 3.0, in a checked archive; refuses others."""
     from fmpy import read_model_description
 
+    unpack(path, folder, [DESCRIPTION])
     try:
         root = ElementTree.parse(folder / DESCRIPTION).getroot()
     except ElementTree.ParseError as error:
@@ -96,15 +97,68 @@ def read_description(folder: Path) -> Any:
     version = root.get("fmiVersion", "none")
     if not re.match(r"2\.0|3\.", version):
         raise RefusedError(f"an FMU of FMI 2.0 or 3.0 (its version is {version})")
-    if root.find("CoSimulation") is None:
-        kinds = [kind for kind in ("ModelExchange", "ScheduledExecution") if root.find(kind) is not None]
-        expected = f"a co-simulation FMU (it has only: {', '.join(kinds) or 'nothing'})"
-        raise RefusedError(expected, "Export it once more for co-simulation")
     try:
         return read_model_description(folder)
     except Exception as error:  # FMPy has no type of its own for most of what it finds
         reason = " ".join(str(error).split())
         raise RefusedError(f"a {DESCRIPTION} that follows the standard ({reason})") from None
+
+
+def facts_of(described: Any, names: Iterable[str]) -> dict[str, Any]:
+    """What FMPy has read and the names of the files of the archive, for `identify.fmu_description`."""
+    from fmpy import platform, platform_tuple
+
+    fmi3 = described.fmiVersion.startswith("3")
+    slave, experiment = described.coSimulation, described.defaultExperiment
+    times = {"start": "startTime", "stop": "stopTime", "step": "stepSize", "tolerance": "tolerance"}
+    libraries = [name.split("/")[1] for name in names if re.fullmatch(r"binaries/[^/]+/[^/]+", name)]
+    sources = ["sources"] if any(name.startswith("sources/") for name in names) else []
+    return {
+        "fmi": 3 if fmi3 else 2,
+        "name": described.modelName or "",
+        "text": described.description or "",
+        "tool": described.generationTool or "",
+        "token": described.guid,
+        "kinds": kinds_of(described),
+        "platforms": [*dict.fromkeys(libraries), *sources],
+        "here": platform_tuple if fmi3 else platform,
+        "variables": [_facts_of(v) for v in described.modelVariables],
+        "experiment": {name: _number(getattr(experiment, own, None)) for name, own in times.items()},
+        "variable_steps": bool(slave and slave.canHandleVariableCommunicationStepSize),
+        "fixed_step": _number(slave and slave.fixedInternalStepSize),
+    }
+
+
+def kinds_of(described: Any) -> list[str]:
+    """The kinds of an FMU."""
+    kinds = ("CoSimulation", "ModelExchange", "ScheduledExecution")
+    return [kind for kind in kinds if getattr(described, kind[0].lower() + kind[1:]) is not None]
+
+
+def _facts_of(v: Any) -> dict[str, Any]:
+    kind = v.declaredType
+    told = lambda name: getattr(v, name) or getattr(kind, name, None)  # noqa: E731
+    return {
+        "name": v.name,
+        "type": v.type,
+        "causality": v.causality,
+        "variability": v.variability,
+        "initial": v.initial,
+        "unit": told("unit"),
+        "start": v.start,
+        "low": _number(told("min")),
+        "high": _number(told("max")),
+        "items": {item.name: int(item.value) for item in getattr(kind, "items", [])},
+        "shape": v.shape or (),
+        "text": v.description or "",
+    }
+
+
+def _number(value: Any) -> float | None:
+    try:
+        return None if value is None else float(value)
+    except ValueError:  # several, of an array
+        return None
 
 
 def library_of(folder: Path, description: Any) -> Path:
@@ -131,27 +185,39 @@ class Runner:
     def __init__(self, folder: Path, note: mmap.mmap):
         self.folder, self._note = folder, note
         self._time, self._used = 0.0, False
+        self._stop: float | None = None
+        self._fmu: Any = None
 
     def _begin(self, call: str) -> None:
         text = f"{time.monotonic():.3f} {call}".encode()[:NOTE_BYTES]
         self._note[:] = text.ljust(NOTE_BYTES)
 
-    def load(self, path: str) -> dict[str, Any]:
-        """Unpack an FMU, load its library and instantiate it; returns what it says of itself."""
-        self._begin("the unpacking")
-        check_archive(Path(path), shutil.disk_usage(self.folder).free)
-        unpack(Path(path), self.folder)
+    def describe(self, path: str) -> dict[str, Any]:
+        """Read what an FMU says of itself."""
+        self.path = Path(path)
         self._begin("the reading of its model description")
+        check_archive(self.path, shutil.disk_usage(self.folder).free)
+        self._described = read_description(self.path, self.folder)
+        self.fmi = 3 if self._described.fmiVersion.startswith("3") else 2
+        self._references = {v.name: (v.type, v.valueReference) for v in self._described.modelVariables}
+        with zipfile.ZipFile(self.path) as archive:
+            return facts_of(self._described, archive.namelist())
+
+    def load(self) -> None:
+        """Unpack the FMU, load its library and instantiate it."""
+        described = self._described
+        if described.coSimulation is None:
+            expected = f"a co-simulation FMU (it has only: {', '.join(kinds_of(described)) or 'nothing'})"
+            raise RefusedError(expected, "Export it once more for co-simulation")
+        self._begin("the unpacking")
+        unpack(self.path, self.folder)
         from fmpy.fmi2 import FMU2Slave
         from fmpy.fmi3 import FMU3Slave
 
-        described = read_description(self.folder)
-        self.fmi = 3 if described.fmiVersion.startswith("3") else 2
-        self._references = {v.name: (v.type, v.valueReference) for v in described.modelVariables}
         library = library_of(self.folder, described)
         self._begin("the loading of its library")
         try:
-            self._fmu: Any = (FMU3Slave if self.fmi == 3 else FMU2Slave)(
+            self._fmu = (FMU3Slave if self.fmi == 3 else FMU2Slave)(
                 guid=described.guid,
                 unzipDirectory=str(self.folder),
                 modelIdentifier=described.coSimulation.modelIdentifier,
@@ -177,22 +243,21 @@ class Runner:
                 else "it declined"
             )
             raise RefusedError(f"an FMU whose library lets itself be instantiated ({reason})") from None
-        variables = {v.name: (v.type, v.causality) for v in described.modelVariables}
-        return {"fmi": self.fmi, "token": described.guid, "variables": variables}
 
-    def start(self, values: dict[str, Any]) -> None:
-        """Begin a new run at time zero with start values."""
+    def start(self, values: dict[str, Any], inputs: dict[str, Any], stop: float | None) -> None:
+        """Begin a new run at time zero with start values, and inputs that hold from then on."""
         if self._used:
             self._begin("reset")
             self._fmu.reset()
-        self._time, self._used = 0.0, True
+        self._time, self._used, self._stop = 0.0, True, stop
+        if self.fmi == 2:
+            self._begin("setupExperiment")
+            self._fmu.setupExperiment(startTime=0.0, stopTime=stop)
         self.set(values)
         self._begin("its initialisation")
-        if self.fmi == 3:
-            self._fmu.enterInitializationMode(startTime=0.0)
-        else:
-            self._fmu.setupExperiment(startTime=0.0)
-            self._fmu.enterInitializationMode()
+        self._fmu.enterInitializationMode(**({"startTime": 0.0, "stopTime": stop} if self.fmi == 3 else {}))
+        self.set(inputs)
+        self._begin("its initialisation")
         self._fmu.exitInitializationMode()
 
     def set(self, values: dict[str, Any]) -> None:
@@ -213,13 +278,27 @@ class Runner:
 
     def step(self, dt: float, count: int) -> None:
         """Step `count` times by `dt` [s]."""
-        for _ in range(count):
+        begin = self._time
+        for k in range(count):
             self._begin(f"doStep at t = {self._time:.10g} s")
-            self._fmu.doStep(self._time, dt)
-            self._time += dt
+            try:
+                said = self._fmu.doStep(self._time, dt)
+            except Exception as error:
+                raise RuntimeError(f"{error}{self._beyond()}") from None
+            if self.fmi == 3 and said[1]:
+                raise RuntimeError(f"it asks for the end of the simulation{self._beyond()}")
+            self._time = begin + (k + 1) * dt
+
+    def _beyond(self) -> str:
+        """What may be the reason for a failed step: some FMUs end where their default experiment does, if not told when."""
+        end = _number(getattr(self._described.defaultExperiment, "stopTime", None))
+        late = self._stop is None and end is not None and self._time >= end * (1 - 1e-9)
+        return f" (its default experiment ends at {end:g} s: give a later stop_time)" if late else ""
 
     def end(self) -> None:
         """Free the FMU."""
+        if self._fmu is None:
+            return
         self._begin("terminate")
         self._fmu.terminate()
         self._begin("freeInstance")
@@ -238,14 +317,16 @@ class Runner:
         return groups
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Do what is asked, in the order start, set, step, get."""
+        """Do what is asked, in the order load, start, set, step, get."""
         try:
+            if "describe" in request:
+                return self.describe(request["describe"])
             if "load" in request:
-                return self.load(request["load"])
+                self.load()
             if "end" in request:
                 self.end()
             if "start" in request:
-                self.start(request["start"])
+                self.start(*request["start"])
             if "set" in request:
                 self.set(request["set"])
             if "step" in request:

@@ -37,7 +37,7 @@ def identify_schedule(
     """Step-response models over a grid of working points, each the mean of steps up and down.
 
     Args:
-        plant: a `WellPlant` (the default) or an `identify.fmu.FmuPlant`.
+        plant: a `WellPlant` (the default) or an `identify.well_fmu.WellFmuPlant`.
         chokes: positions [%].
         lifts: lift rates [m3/h].
         steps: of the choke [%] and of the lift [m3/h], positive.

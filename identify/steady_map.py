@@ -26,7 +26,7 @@ def steady_map(
     """Steady gas and oil rate over a grid of choke positions and lift rates.
 
     Args:
-        plant: a `WellPlant` (the default) or an `identify.fmu.FmuPlant`.
+        plant: a `WellPlant` (the default) or an `identify.well_fmu.WellFmuPlant`.
         chokes: two or more increasing positions [%]; 2, 4, ... 100 % by default.
         lifts: two or more increasing rates [m3/h]; 0 to 10000 by default.
 

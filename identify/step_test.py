@@ -122,7 +122,7 @@ def identify_step_response(
     """Identify a step-response model by stepping each MV alone, (4.2)-(4.3).
 
     Args:
-        plant: a `WellPlant` (the default) or an `identify.fmu.FmuPlant`; its `dt` is the model's.
+        plant: a `WellPlant` (the default) or an `identify.well_fmu.WellFmuPlant`; its `dt` is the model's.
         choke: position at the working point [%].
         lift: lift rate at the working point [m3/h].
         steps: of the choke [%] and of the lift [m3/h], not zero.

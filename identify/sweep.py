@@ -57,7 +57,7 @@ def steady_sweep(plant: Any = None, chokes: ArrayLike | None = None, lifts: Arra
     """Steady states over a grid, and the step coefficients between neighbouring choke positions.
 
     Args:
-        plant: a `WellPlant` (the default) or an `identify.fmu.FmuPlant`.
+        plant: a `WellPlant` (the default) or an `identify.well_fmu.WellFmuPlant`.
         chokes: increasing positions [%], two or more; by default 2, 4, ... 100 %.
         lifts: rates [m3/h]; by default 5000, 7500 and 10000.
 

@@ -28,10 +28,14 @@ if not _os.environ.get("JAXMPC_NO_JIT_CACHE"):
 _watch()
 
 _HOME_OF = {
+    "Actuator": "process.actuator",
     "Controller": "controller.controller",
     "Controllers": "controller.controller",
     "Event": "loop.events",
+    "FunctionPlant": "process.function_plant",
     "InputError": "errors",
+    "ModelPlant": "process.model_plant",
+    "Parameter": "process.plant",
     "Reference": "loop.reference",
     "SensorFault": "controller.measurement",
     "SteadyMap": "steady.map",

@@ -19,6 +19,10 @@ from jaxmpc.model.step_response import make_model as make_model
 from jaxmpc.problem.structure import Structure as Structure
 from jaxmpc.problem.tuning import make_tuning as make_tuning
 from jaxmpc.problem.tuning import stack_tunings as stack_tunings
+from jaxmpc.process.actuator import Actuator as Actuator
+from jaxmpc.process.function_plant import FunctionPlant as FunctionPlant
+from jaxmpc.process.model_plant import ModelPlant as ModelPlant
+from jaxmpc.process.plant import Parameter as Parameter
 from jaxmpc.process.well.plant import WellPlant as WellPlant
 from jaxmpc.steady.map import SteadyMap as SteadyMap
 from jaxmpc.steady.optimise import optimise as optimise

@@ -1,4 +1,4 @@
-"""``jaxmpc fmu build`` and ``jaxmpc identify``: the well as an FMU, and a model from its step responses."""
+"""``jaxmpc fmu build``, ``fmu info`` and ``identify``: the well as an FMU, what FMUs are, and a model from step tests."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import contextlib
 import sys
 from pathlib import Path
 
-from jaxmpc.cli.options import EXIT_OPTIMAL, PLANTS, Options, choice, command, option
+from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, PLANTS, Options, choice, command, option
+from jaxmpc.errors import InputError
 from jaxmpc.files import check_target
 
 
@@ -17,11 +18,24 @@ from jaxmpc.files import check_target
 )
 def build(options: Options) -> int:
     """Build the gas-lifted well as a co-simulation FMU; needs a C compiler."""
-    from identify.fmu import build_fmu
+    from identify.well_fmu import build_fmu
 
     if options.out is not None:
         check_target("--out", options.out)
     print(build_fmu(fmi=options.fmi, out=options.out))
+    return EXIT_OPTIMAL
+
+
+@command("fmu info", option("fmu", "FMU", "an FMU of FMI 2.0 or 3.0", Path), epilog=EXITS)
+def info(options: Options) -> int:
+    """List the variables of an FMU, its default experiment and its machines, from its description; nothing of it runs."""
+    from identify.fmu_process import FmuProcess
+
+    try:
+        with FmuProcess(options.fmu) as fmu:
+            print(fmu.description.table())
+    except InputError as error:
+        raise InputError("FMU", error.value, error.expected, error.hint) from None
     return EXIT_OPTIMAL
 
 
@@ -42,9 +56,9 @@ def identify(options: Options) -> int:
     with contextlib.ExitStack() as stack:
         plant = None  # the JAX well
         if options.plant == "fmu":
-            from identify.fmu import FmuPlant
+            from identify.well_fmu import WellFmuPlant
 
-            plant = stack.enter_context(FmuPlant())
+            plant = stack.enter_context(WellFmuPlant())
         start = options.choke, options.lift
         model = identify_step_response(plant, *start, tuple(options.steps), options.samples)
     for note in settling_notes(model):

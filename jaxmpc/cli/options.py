@@ -17,7 +17,7 @@ EXIT_OPTIMAL, EXIT_OTHER, EXIT_BAD_INPUT, EXIT_INFEASIBLE, EXIT_LIMIT = 0, 1, 2,
 EXITS = "Exit status: 0 done, 2 bad input, 130 stopped by Ctrl-C, 1 anything else."
 PLANTS = ("fmu", "jax")
 FAMILIES = {
-    "fmu": "Build the well as an FMU.",
+    "fmu": "Build the well as an FMU, and look into any FMU.",
     "study": "Run studies, look at them, and export their results.",
 }
 Options = argparse.Namespace

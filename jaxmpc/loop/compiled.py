@@ -22,8 +22,7 @@ from jaxmpc.controller.controller import Batch, considered
 from jaxmpc.controller.core import Moment
 from jaxmpc.controller.measurement import received
 from jaxmpc.controller.sample import Sample
-from jaxmpc.loop.events import Stage, together
-from jaxmpc.problem.tuning import Tuning
+from jaxmpc.loop.events import Course, Stage
 from jaxmpc.programs.clock import Clock
 from jaxmpc.programs.compilation import compiling_for
 from jaxmpc.programs.lanes import Lanes
@@ -100,7 +99,7 @@ def simulate_compiled(
             inputs.part(part),
             record,
             place,
-            together([stages[k] for k in part]) if stages else [],
+            [stages[k] for k in part] if stages else [],
             held,
         )
         for part, place in zip(parts, places, strict=True)
@@ -136,12 +135,11 @@ class _Run:
         inputs: Inputs,
         record: Collection[str],
         place: Any,
-        stages: Sequence[tuple[int, list[Stage]]],
+        stages: Sequence[Sequence[Stage]],
         held: bool,
     ):
-        self.controllers, self.plants, self.record, self.place = controllers, plants, record, place
-        self.stages, self.held = list(stages), held  # `held`: whether an MV is in any run
-        self.tunings: list[Tuning] = []
+        self.course, self.held = Course(controllers, stages), held  # `held`: whether an MV is in any run
+        self.plants, self.record, self.place = plants, record, place
         self.count, self.samples = controllers.count, inputs.setpoints.shape[1]
         outside = [inputs.setpoints, inputs.errors, inputs.faults, inputs.dv, inputs.disturbance]
         together = np.concatenate(outside, axis=2)
@@ -151,23 +149,13 @@ class _Run:
         # beyond the end the last sample is repeated
         self.inputs = np.concatenate([together, np.repeat(together[:, -1:], self.window, axis=1)], axis=1)
         self.told = inputs.told.astype(float)[:, None]
-        self._take(controllers)
-        self._enter(self.stages.pop(0)[1] if self.stages else [])
+        self._take()
 
-    def _take(self, controllers: Batch) -> None:
-        """Go on with other controllers."""
-        self.controllers = controllers
-        leaves, self.form = flattened((controllers.cores, self.plants))
+    def _take(self) -> None:
+        """Go on with the controllers of the course."""
+        self.controllers = self.course.controllers
+        leaves, self.form = flattened((self.controllers.cores, self.plants))
         self.leaves = leaves if self.place is None else jax.device_put(leaves, self.place)
-
-    def _enter(self, stages: list[Stage]) -> None:
-        """Go on as every scenario's stage says."""
-        tunings = [stage.tuning for stage in stages]
-        if self.tunings and any(a is not b for a, b in zip(tunings, self.tunings, strict=True)):
-            self._take(self.controllers.of(self.controllers.scenarios.with_tunings(tunings)))
-        self.tunings = tunings
-        # without an MV that is held in any run, programs know of none
-        self.manual = np.array([stage.manual for stage in stages]) if self.held else np.zeros((self.count, 0))
 
     def start(self) -> Any:
         """The packed `Now` before the first sample."""
@@ -206,7 +194,9 @@ class _Run:
             ``(packed, seen, done, count, decided)``: the sample measured last, fields of what was measured since and of what
             was carried out, how many samples were measured, and whether all scenarios of the last one are decided.
         """
-        settings = np.concatenate([self.controllers.settings, self.told, self.manual], axis=1)
+        # without an MV that is held in any run, programs know of none
+        manual = self.course.manual if self.held else np.zeros((self.count, 0))
+        settings = np.concatenate([self.controllers.settings, self.told, manual], axis=1)
         given = (packed, self.inputs[:, begin : begin + self.window], settings)
         given = given if self.place is None else jax.device_put(given, self.place)
         packed, rows, (count, decided) = _stride(self.leaves, *given, most, self.form, self.of_now)
@@ -220,13 +210,12 @@ class _Run:
         fields: dict[str, np.ndarray] = {}
         done = acted = 0  # only the first call has nothing to carry out
         while done < self.samples and not stopped():
-            if self.stages and self.stages[0][0] == done + acted:
-                self._enter(self.stages.pop(0)[1])
+            if self.course.enter(done + acted):
+                self._take()
             clock = Clock()
             # the sample after the last is measured, too: nothing else is carried out at the end
-            end = self.stages[0][0] if self.stages else self.samples + 1
-            most = min(end - done - acted, LONGEST)
-            packed, seen, doings, count, decided = self.stride(packed, done, most)
+            most = int(min(self.course.next, self.samples + 1)) - done - acted
+            packed, seen, doings, count, decided = self.stride(packed, done, min(most, LONGEST))
             seconds = clock.seconds
             # the first row of what was seen is the sample after the one that was carried out first
             first, carried, acted = done + acted, count - 1 + acted, 1

@@ -88,7 +88,9 @@ def stages_of(
                     f"{at}.{kind}_on", sorted(goes & comes)[0], f"a {kind.upper()} that is not in {kind}_off"
                 )
             off[kind] = (off[kind] | goes) - comes
-        if event.tuning or event.cv_off or event.cv_on:  # where it does not change, nothing is made of it again
+        if (
+            event.tuning or event.cv_off or event.cv_on
+        ):  # where it does not change, nothing is made of it again
             now = without(tuning, flags("cv")) if off["cv"] else tuning
         stage = Stage(first, now, flags("mv"))
         stages = [*(s for s in stages if s.first < first), stage]
@@ -147,7 +149,43 @@ def has_lanes(events: Sequence[Any]) -> bool:
     return any(isinstance(entry, (list, tuple)) for entry in events)
 
 
-def together(lanes: Sequence[Sequence[Stage]]) -> list[tuple[int, list[Stage]]]:
+class Course:
+    """Controllers that go through their stages.
+
+    Args:
+        controllers: in their first stages.
+        stages: of every lane; none where there are no events.
+
+    Attributes:
+        controllers: as they are now.
+        manual: ``"lane mv"``, MVs that are held now.
+    """
+
+    def __init__(self, controllers: Any, stages: Sequence[Sequence[Stage]]):
+        self.controllers, self._coming = controllers, _together(stages)
+        self.manual = np.zeros((controllers.count, controllers.structure.mv_count), dtype=bool)
+        self._tunings: list[Tuning] = []
+        self.enter(0)
+
+    @property
+    def next(self) -> float:
+        """The sample at which a stage of any lane begins; infinite where none does any more."""
+        return self._coming[0][0] if self._coming else np.inf
+
+    def enter(self, sample: int) -> bool:
+        """Go on as the stages say that begin at this sample; whether the controllers are others then."""
+        if sample != self.next:
+            return False
+        now = self._coming.pop(0)[1]
+        tunings, before = [stage.tuning for stage in now], self._tunings
+        self._tunings, self.manual = tunings, np.array([stage.manual for stage in now])
+        if not before or all(a is b for a, b in zip(tunings, before, strict=True)):
+            return False
+        self.controllers = self.controllers.of(self.controllers.scenarios.with_tunings(tunings))
+        return True
+
+
+def _together(lanes: Sequence[Sequence[Stage]]) -> list[tuple[int, list[Stage]]]:
     """Where the stage of any of these lanes begins, and the stage that each is then in."""
     firsts = sorted({stage.first for stages in lanes for stage in stages})
     at = lambda stages, first: [stage for stage in stages if stage.first <= first][-1]  # noqa: E731

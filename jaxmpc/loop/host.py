@@ -17,7 +17,7 @@ from jaxmpc.controller.core import ControllerState, StepInfo
 from jaxmpc.controller.measurement import received
 from jaxmpc.controller.sample import Sample
 from jaxmpc.loop.compiled import Inputs
-from jaxmpc.loop.events import Stage
+from jaxmpc.loop.events import Course, Stage
 from jaxmpc.loop.interventions import CarriedOut
 
 REPORT = 20  # samples between two progress reports
@@ -27,49 +27,37 @@ def simulate_on_host(
     controllers: Any,
     plant: Any,
     inputs: Inputs,
-    stages: Sequence[Stage],
+    stages: Sequence[Sequence[Stage]],
     blind: int | None,
     progress: Callable[[int, int], None] | None,
 ) -> dict[str, np.ndarray]:
     """One closed loop; fields of `Trajectory`.
 
     Args:
-        controllers: a single one that steps like `Batch`, in the first stage.
-        stages: what holds from which sample on, where there are events.
+        controllers: a single one that steps like `Batch`, in its first stage.
+        stages: as of `simulate_compiled`.
         blind: sample whose plan is carried out without feedback; None for none.
         progress: called with ``(done, total)`` samples.
     """
-    setpoints, offsets, errors, faults = (v[0] for v in inputs[:4])
-    told, total, named = bool(inputs.told[0]), len(setpoints), hasattr(plant, "disturbance_names")
-    future = controllers.size.future if inputs.preview else 1
-    beyond = lambda v: np.concatenate([v, np.repeat(v[-1:], future, axis=0)])  # noqa: E731
-    references, dvs = beyond(setpoints), beyond(inputs.dv[0])
-    ahead = int(inputs.preview)  # the setpoint of the sample itself where no other is told
-    outputs = plant.init()
+    offsets, errors, faults = inputs.disturbance[0], inputs.errors[0], inputs.faults[0]
+    total, named = len(offsets), hasattr(plant, "disturbance_names")
+    outputs, course, told = plant.init(), Course(controllers, stages), Told(inputs, controllers.size.future)
     now, mv = np.asarray(outputs.cv), np.asarray(outputs.mv)
-    unknown, manual = np.full_like(mv, np.nan), np.zeros(len(mv), dtype=bool)
     state = controllers.init(now[None], mv[None])
-    first = _sample(now, now[None], unknown, manual, dvs[:future])
-    controllers.decide(state, first)  # compile before the clock starts
-    entered = {stage.first: stage for stage in stages}
-    tuning = stages[0].tuning if stages else None
+    controllers.decide(
+        state, told.sample(0, now[None], mv[None], course.manual)
+    )  # compile before the clock starts
     records: list[dict[str, Any]] = []
     carried = None
     with _undisturbed():
         for k in range(total):
             cv = np.asarray(outputs.cv) + errors[k]
-            if k in entered:
-                stage = entered[k]
-                if stage.tuning is not tuning:
-                    controllers = controllers.of(controllers.scenarios.with_tunings([stage.tuning]))
-                tuning, manual = stage.tuning, stage.manual
+            course.enter(k)
             if carried is None or blind is None:
                 arrived = received(cv, faults[k], np.asarray(state.sensors.value)[0])
-                stands = np.asarray(outputs.mv) if told else unknown
-                wanted = references[k + ahead : k + ahead + future]
-                sample = _sample(arrived, wanted, stands, manual, dvs[k : k + future])
-                state, info = controllers.decide(state, sample)
-                record = _record(cv, state, info)
+                sample = told.sample(k, arrived[None], np.asarray(outputs.mv)[None], course.manual)
+                state, info = course.controllers.decide(state, sample)
+                record = {name: value[0] for name, value in recorded(cv[None], state, info).items()}
                 carried = CarriedOut(controllers.structure, record) if k == blind else None
             else:
                 record = carried.record(k - blind, cv)
@@ -80,20 +68,41 @@ def simulate_on_host(
     return {name: np.stack([record[name] for record in records]) for name in records[0]}
 
 
-def _sample(
-    cv: np.ndarray, setpoint: np.ndarray, mv: np.ndarray, manual: np.ndarray, dv: np.ndarray
-) -> Sample:
-    """Of one lane, with its axis."""
-    return Sample(cv[None], setpoint[None], mv[None], manual[None], dv[None] if dv.size else None)
+class Told:
+    """What controllers are told at a sample, all arrays with a lane axis.
+
+    Args:
+        future: samples of the shift register, which a preview covers; beyond the end of the run the last sample is repeated.
+    """
+
+    def __init__(self, inputs: Inputs, future: int):
+        self.preview, self.positions = inputs.preview, inputs.told[:, None]
+        self.rows = rows = future if inputs.preview else 1
+        beyond = lambda v: np.concatenate([v, np.repeat(v[:, -1:], rows, axis=1)], axis=1)  # noqa: E731
+        self.setpoints, self.dv = beyond(inputs.setpoints), beyond(inputs.dv)
+
+    def sample(self, k: int, cv: np.ndarray, mv: np.ndarray, manual: np.ndarray, gone: Any = False) -> Sample:
+        """Sample k.
+
+        Args:
+            cv: what arrived [CV unit].
+            mv: where the actuators stand, told to lanes with position feedback [MV unit].
+            manual: MVs that are held.
+            gone: MVs of no plant, which are held where they stood.
+        """
+        first = k + 1 if self.preview else k  # the setpoint of the sample itself where no other is told
+        dv = self.dv[:, k : k + self.rows] if self.dv.size else None
+        stands = np.where(self.positions | gone, mv, np.nan)
+        return Sample(cv, self.setpoints[:, first : first + self.rows], stands, manual | gone, dv)
 
 
-def _record(cv: np.ndarray, state: ControllerState, info: StepInfo) -> dict[str, Any]:
-    """What a sample leaves behind, by the names of `Trajectory`."""
+def recorded(cv: np.ndarray, state: ControllerState, info: StepInfo) -> dict[str, np.ndarray]:
+    """What a sample of some lanes leaves behind, by the names of `Trajectory`; `cv` as sensors without fault measure it."""
     found = {f.name: getattr(info, f.name) for f in dataclasses.fields(info) if f.name != "recovering"}
     found |= dict(
         mv_demand=found.pop("mv"), plan=found.pop("moves"), bias=state.bias, bias_raw=state.bias_raw
     )
-    return {"cv": cv} | {name: np.asarray(value)[0] for name, value in found.items()}
+    return {"cv": cv} | {name: np.asarray(value) for name, value in found.items()}
 
 
 @contextlib.contextmanager

@@ -51,14 +51,14 @@ class Sweep:
         plants,
         reference,
         *,
-        samples,
-        disturbance,
-        noise,
-        seed,
-        faults,
-        position_feedback,
-        preview,
-        events,
+        samples=None,
+        disturbance=None,
+        noise=None,
+        seed=0,
+        faults=None,
+        position_feedback=False,
+        preview=False,
+        events=(),
     ) -> Sweep:
         """The sweep, or an `InputError` that names what does not fit."""
         plants = plants if isinstance(plants, Lanes) else for_all(plants)

@@ -101,7 +101,7 @@ def simulate(
         record = _one_lane(run.controllers, plant, inputs, stages, (*RECORDABLE, "plan"), progress)
     else:
         host = HostPlant(plant) if isinstance(plant, JaxPlant) else plant
-        record = simulate_on_host(run.controllers, host, inputs, stages[0] if stages else [], blind, progress)
+        record = simulate_on_host(run.controllers, host, inputs, stages, blind, progress)
     plan = record.pop("plan")[:, : structure.block_count]
     kept = {"plan": plan} if keep_plans else {}
     return Trajectory(setpoint=setpoints, **record, **kept, **_labels(structure, len(setpoints)))

@@ -1,52 +1,125 @@
-"""The choke actuators, part of every plant: a continuous choke, and the step choke of the thesis (chapter 6).
+"""Actuators, part of every plant: what becomes of the demands of a controller.
 
-A step choke has positions 2 % apart and moves only once the demand is far enough from where it stands.
-`jaxmpc.process.well.plant` and the FMU plant call these, so that a demand means the same on both.
+An actuator follows its demand, moves between positions one step apart, or stands at one of a list of values. Plants of every
+kind move theirs with these, on the host and inside compiled programs, so that a demand means the same on all of them.
 """
 
 from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.errors import InputError
+from jaxmpc.check import is_number
+from jaxmpc.errors import InputError, near
 
-ACTUATORS = ("continuous", "step")
-STEP = 2.0  # % between two positions
-THRESHOLD = 1.6  # % from the present position at which the choke moves
-TOLERANCE = 1e-9  # %, so that rounding in the demand does not cost a move
-
-
-def _numeric(*values):  # NumPy stays NumPy: a loop on the host need not pay for JAX dispatch
-    return jnp if any(isinstance(value, jax.Array) for value in values) else np
+KINDS = ("continuous", "stepped", "values", "on-off")
+TOLERANCE = 5e-10  # of a step, so that rounding in the demand does not cost a move
 
 
-def step_choke(position, demand):
-    """Position of the step choke [%] after a demand [%], which is limited to 0..100.
+@dataclasses.dataclass(frozen=True)
+class Actuator:
+    """What moves one MV; all numbers in its unit.
 
-    It goes to the position (a multiple of 2 %) nearest to the demand if that is 1.6 % or more away from where
-    the choke stands, and stays there otherwise. Halfway between two positions, the more open one is nearest.
+    Raises:
+        InputError: naming the field that is wrong, below ``actuator``.
     """
-    xp = _numeric(position, demand)
-    demand = xp.clip(demand, 0.0, 100.0)
-    nearest = STEP * xp.floor(demand / STEP + 0.5)
-    return xp.where(xp.abs(demand - position) >= THRESHOLD - TOLERANCE, nearest, position)
+
+    kind: Literal["continuous", "stepped", "values", "on-off"] = "continuous"
+    low: float = -math.inf  # the demand is limited to low..high; on-off: off and on
+    high: float = math.inf
+    step: float = 0.0  # stepped: between two positions, which are origin + k step
+    threshold: float | None = (
+        None  # stepped: how far off the demand must be for a move; half a step if not given
+    )
+    origin: float = 0.0  # stepped: one of the positions
+    values: tuple[float, ...] = ()  # values: where it can stand
+
+    def __post_init__(self):
+        if self.kind not in KINDS:
+            raise InputError("actuator.kind", self.kind, f"one of {', '.join(KINDS)}", near(self.kind, KINDS))
+        object.__setattr__(self, "values", tuple(self.values))
+        if any(math.isnan(limit) for limit in (self.low, self.high)) or not self.low < self.high:
+            raise InputError("actuator.low", (self.low, self.high), "low below high [MV unit]")
+        stepped, listed = self.kind == "stepped", self.kind == "values"
+        for name, own in (("step", stepped), ("threshold", stepped), ("values", listed)):
+            if not own and getattr(self, name) not in (0.0, None, ()):
+                raise InputError(f"actuator.{name}", getattr(self, name), f"none for one of kind {self.kind}")
+        if stepped and not (is_number(self.step) and self.step > 0):
+            raise InputError("actuator.step", self.step, "a positive distance of two positions [MV unit]")
+        if self.threshold is not None and not (is_number(self.threshold) and self.threshold > 0):
+            raise InputError("actuator.threshold", self.threshold, "a positive distance [MV unit]")
+        if not is_number(self.origin):
+            raise InputError("actuator.origin", self.origin, "a position [MV unit]")
+        if stepped and self._steps[0] > self._steps[1]:
+            raise InputError(
+                "actuator.step", self.step, f"a position from {self.low} to {self.high} [MV unit]"
+            )
+        increasing = all(map(is_number, self.values)) and all(np.diff(self.values) > 0)
+        if listed and not (len(self.values) > 1 and increasing):
+            raise InputError("actuator.values", self.values, "two or more numbers, increasing [MV unit]")
+        if self.kind == "on-off" and not (is_number(self.low) and is_number(self.high)):
+            raise InputError("actuator.low", (self.low, self.high), "two finite values, off and on [MV unit]")
+
+    def move(self, position, demand):
+        """Position after a demand [MV unit], elementwise; NumPy stays NumPy.
+
+        A stepped actuator goes to the position nearest to the demand (halfway between two, to the higher one) if the demand
+        is `threshold` or more away from where it stands, one with a list of values once another value is nearer.
+        """
+        # a loop on the host need not pay for JAX dispatch
+        xp: Any = jnp if isinstance(position, jax.Array) or isinstance(demand, jax.Array) else np
+        demand = xp.clip(demand, self.low, self.high)
+        if self.kind == "continuous":
+            return demand
+        away = xp.abs(demand - position)
+        if self.kind == "stepped":
+            threshold = self.step / 2 if self.threshold is None else self.threshold
+            count = xp.clip(xp.floor((demand - self.origin) / self.step + 0.5), *self._steps)
+            nearest = self.origin + self.step * count
+            return xp.where(away >= threshold - TOLERANCE * self.step, nearest, position)
+        values = self.values or (self.low, self.high)
+        nearest = values[0]
+        for value in values[1:]:
+            nearest = xp.where(xp.abs(demand - value) < xp.abs(demand - nearest), value, nearest)
+        nearer = xp.abs(demand - nearest) < away - TOLERANCE * min(np.diff(values))
+        return xp.where(nearer, nearest, position)
+
+    @property
+    def _steps(self) -> tuple[float, float]:
+        """Steps from the origin to the lowest and to the highest position."""
+        first, last = ((limit - self.origin) / self.step for limit in (self.low, self.high))
+        return np.ceil(first - TOLERANCE), np.floor(last + TOLERANCE)
 
 
-def move_choke(actuator: str, position, demand):
-    """Position of the choke [%] after a demand [%], for either actuator.
+@dataclasses.dataclass(frozen=True)
+class Actuators:
+    """The actuators of a plant, one per MV."""
 
-    Args:
-        actuator: ``continuous`` (follows the demand within 0..100 %) or ``step`` (see `step_choke`).
-    """
-    if actuator == "step":
-        return step_choke(position, demand)
-    return _numeric(position, demand).clip(demand, 0.0, 100.0)
+    each: tuple[Actuator, ...]
 
+    @classmethod
+    def of(cls, actuators: Iterable[Actuator], count: int | None = None) -> Actuators:
+        """These, or where there are none, `count` continuous ones without limits.
 
-def check_actuator(actuator: object, path: str = "actuator") -> str:
-    """Return the actuator's name, or raise `InputError` if there is no such actuator."""
-    if actuator not in ACTUATORS:
-        raise InputError(path, actuator, f"one of {', '.join(ACTUATORS)}")
-    return str(actuator)
+        Raises:
+            InputError: if there are not `count`.
+        """
+        each = tuple(actuators) or (Actuator(),) * (count or 0)
+        if count is not None and len(each) != count:
+            raise InputError("actuators", f"{len(each)} actuators", f"{count}, one per MV")
+        return cls(each)
+
+    def move(self, position, demand):
+        """Positions ``"... mv"`` after demands ``"... mv"`` [MV unit], see `Actuator.move`."""
+        xp: Any = jnp if isinstance(position, jax.Array) or isinstance(demand, jax.Array) else np
+        if all(one.kind == "continuous" for one in self.each):
+            low, high = (np.array([getattr(one, name) for one in self.each]) for name in ("low", "high"))
+            return xp.clip(demand, low, high)
+        moved = [one.move(position[..., k], demand[..., k]) for k, one in enumerate(self.each)]
+        return xp.stack(moved, axis=-1)

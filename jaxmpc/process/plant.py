@@ -2,10 +2,13 @@
 
 `JaxPlant` runs inside compiled loops, many lanes side by side. A `StatefulPlant`, an FMU or a class of one's own, is
 stepped from the host; nothing has to inherit from it. Disturbances are a vector in the order of `disturbance_names`.
+Plants list their parameters, and any of these may vary from lane to lane (`lanes_of_plants`).
 """
 
+import dataclasses
 from abc import abstractmethod
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import equinox as eqx
 import jax
@@ -13,6 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
+
+from jaxmpc.check import as_floats
+from jaxmpc.errors import InputError, near
+from jaxmpc.programs.lanes import Lanes, for_all
 
 
 class Outputs(NamedTuple):
@@ -36,11 +43,71 @@ class PlantOutputs(Protocol):
         ...
 
 
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """A number of a plant that may be replaced."""
+
+    name: str
+    unit: str  # "1" without unit
+    default: float  # what the plant has where nothing is given
+    label: str = ""  # for legends and tables
+    low: float = -np.inf
+    high: float = np.inf
+    positive: bool = False  # whether 0 is too little
+
+    @property
+    def expected(self) -> str:
+        """What a value must be, in words, with the unit."""
+        if self.positive:
+            return f"a finite positive number [{self.unit}]"
+        if np.isfinite((self.low, self.high)).all():
+            return f"a number from {self.low:g} to {self.high:g} [{self.unit}]"
+        return f"a finite number [{self.unit}]" + (f", {self.low:g} or more" if self.low > -np.inf else "")
+
+    def checked(self, value: Any) -> np.ndarray:
+        """The value, or one per lane, as floats. Raises `InputError` for what is not finite or out of range."""
+        numbers = as_floats(f"plant.{self.name}", value, self.expected)
+        good = np.isfinite(numbers) & (numbers >= self.low) & (numbers <= self.high)
+        if numbers.ndim > 1 or not numbers.size or not (good & (not self.positive or numbers > 0)).all():
+            raise InputError(f"plant.{self.name}", np.asarray(value).tolist(), self.expected)
+        return numbers
+
+
+def checked_parameters(table: Sequence[Parameter], values: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Values by name, numbers or one per lane.
+
+    Raises:
+        InputError: at ``plant.NAME`` for a name that is not in the table, or a value that cannot be; for unequal lanes.
+    """
+    known = {parameter.name: parameter for parameter in table}
+    for name in values:
+        if name not in known:
+            expected = (
+                f"a parameter of the plant: {', '.join(known)}" if known else "nothing: it has no parameters"
+            )
+            raise InputError(f"plant.{name}", values[name], expected, near(name, known))
+    found = {name: known[name].checked(value) for name, value in values.items()}
+    counts = {name: len(value) for name, value in found.items() if value.ndim}
+    if len(set(counts.values())) > 1:
+        raise InputError("plant", counts, "one number of lanes in all parameters that have lanes")
+    return found
+
+
 class JaxPlant(eqx.Module):
     """A plant in JAX, sampled every `dt` seconds; its methods are pure and may be vmapped."""
 
     dt: eqx.AbstractVar[float]
     disturbance_names: eqx.AbstractVar[tuple[str, ...]]
+    parameter_table: ClassVar[tuple[Parameter, ...]] = ()  # what `replaced` takes; others may have a property
+
+    def replaced(self, values: Mapping[str, ArrayLike]) -> Self:
+        """The plant with other parameters, numbers or ``"lane"`` arrays; see `lanes_of_plants` for the latter.
+
+        Raises:
+            InputError: naming the parameter, for one that is not in `parameter_table` or a value that cannot be.
+        """
+        checked_parameters(self.parameter_table, values)
+        return self
 
     @abstractmethod
     def init(self) -> Any:
@@ -104,3 +171,19 @@ class StatefulPlant(Protocol):
 def disturbances_of(plant: Any) -> tuple[str, ...]:
     """Names of the disturbances of a plant of any kind."""
     return tuple(getattr(plant, "disturbance_names", ("disturbance",)))
+
+
+def lanes_of_plants(plant: JaxPlant, values: Mapping[str, ArrayLike]) -> Lanes[JaxPlant]:
+    """Variants of a plant: parameters given as ``"lane"`` arrays vary, numbers hold for all, and the rest is kept once.
+
+    Raises:
+        InputError: as `JaxPlant.replaced`.
+    """
+    numbers = {name: value for name, value in values.items() if not np.ndim(value)}
+    plant = plant.replaced(numbers) if numbers else plant
+    varying = {name: value for name, value in values.items() if name not in numbers}
+    if not varying:
+        return for_all(plant)
+    plants = plant.replaced(varying)
+    has_lanes = jax.tree.map(lambda new, old: np.ndim(new) > np.ndim(old), plants, plant)
+    return Lanes(*eqx.partition(plants, has_lanes))

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from identify.fmu import FmuPlant, build_fmu
 from identify.schedule import identify_schedule
 from identify.step_test import identify_step_response, identity, settling_notes
 from identify.sweep import steady_sweep
+from identify.well_fmu import WellFmuPlant, build_fmu
 from jaxmpc.process.well.plant import WellPlant
 from studies.definition.comparison import PLANTS, ComparisonDefinition, PlantKind
 from studies.definition.refusing import require
@@ -90,9 +90,9 @@ def plant_factory(
         return (lambda actuator: WellPlant(actuator=actuator)), {"kind": known, "hash": digest}
     path = build_fmu()
     say(f"FMU: {path}")
-    with FmuPlant(path) as built:
+    with WellFmuPlant(path) as built:
         facts = {"kind": "fmu", "hash": built.token, "fmi": built.fmi}
-    return (lambda actuator: FmuPlant(path, actuator=actuator)), facts
+    return (lambda actuator: WellFmuPlant(path, actuator=actuator)), facts
 
 
 def steady_variables(plant: Any) -> dict[str, xr.DataArray]:

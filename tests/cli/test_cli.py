@@ -268,7 +268,7 @@ def test_a_missing_tool_ends_with_one_line_and_status_one(stub, capsys):
     def build_fmu(**_):
         raise MissingToolError("no C compiler:\ninstall gcc")
 
-    stub("identify.fmu", build_fmu=build_fmu)
+    stub("identify.well_fmu", build_fmu=build_fmu)
     assert main(["fmu", "build"]) == 1
     assert capsys.readouterr().err == "jaxmpc: no C compiler: install gcc\n"
 
@@ -287,7 +287,7 @@ def test_a_plant_that_fails_ends_with_one_line_and_status_one(stub, tmp_path, ca
 
 def test_fmu_build_prints_where_the_fmu_is(stub, tmp_path, capsys):
     given = {}
-    stub("identify.fmu", build_fmu=lambda **options: given.update(options) or "well.fmu")
+    stub("identify.well_fmu", build_fmu=lambda **options: given.update(options) or "well.fmu")
     assert main(["fmu", "build", "--fmi", "3", "--out", str(tmp_path / "x.fmu")]) == 0
     assert capsys.readouterr().out == "well.fmu\n"
     assert given == {"fmi": 3, "out": tmp_path / "x.fmu"}

@@ -1,385 +1,255 @@
-"""The FMU of the well: its build, its conformance, and its agreement with the JAX plant."""
+"""An FMU of any process as a plant: what is set and read, how it is stepped, what is refused, and what is told of it."""
 
-import ctypes
-import gc
-import io
-import os
-import re
-import subprocess
-import sys
-import zipfile
-from pathlib import Path
+import math
 
-import fmpy
-import jax
-import numpy as np
 import pytest
-from fmpy.fmi2 import FMU2Slave
-from fmpy.fmi3 import FMU3Slave
 
-import identify.fmu as fmu_module
-from identify.fmu import FmuPlant, build_fmu, validate_fmu
-from identify.fmu_source import INPUT_SEQUENCE, fmu_files
-from jaxmpc.errors import InputError, MissingToolError
-from jaxmpc.process.well.equations import SHIPPED_STEADY_STATE, WellParameters
-from jaxmpc.process.well.plant import WellPlant, WellState, steady_state_of
-from tests.process.test_plant import random_demands
+from identify.fmu import FmuPlant
+from jaxmpc.cli.main import main
+from jaxmpc.errors import InputError, PlantError
+from jaxmpc.process.actuator import Actuator
+from tests import fmus
 
-PLANT = WellPlant()
-run = jax.jit(PLANT.run)
-run_stepped = jax.jit(PLANT.with_actuator("step").run)
+VARIES = 'canHandleVariableCommunicationStepSize="true"'
 
 
-@pytest.fixture(scope="module", params=[2, 3], ids=["FMI 2.0", "FMI 3.0"])
-def path(request):
-    try:
-        return build_fmu(request.param)
-    except MissingToolError as error:
-        pytest.skip(str(error))
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    """An FMU that takes steps of any size and proposes none."""
+    return fmus.make_fmu(tmp_path_factory.mktemp("fmu"), fmus.describe(attributes=VARIES))
 
 
-@pytest.fixture
-def plant(path):
-    with FmuPlant(path) as plant:
-        yield plant
+# ------------------------------------------------------------------------------------------------ what is exchanged
 
 
-def resident_bytes(process="self"):
-    with open(f"/proc/{process}/statm") as file:
-        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+def test_demands_are_limited_and_rounded_as_the_types_want_it_and_the_plant_says_where_they_stand(path):
+    mv = {"u": (0.0, 10.0), "n": Actuator("values", values=(0.0, 4.0)), "b": None, "mode": None}
+    with FmuPlant(path, mv, ["sum", "steps"], dt=10.0) as plant:
+        assert plant.init().mv.tolist() == [0, 0, 0, 0]
+        out = plant.step([12.5, 3.1, 0.5, 3.0])
+        assert out.mv.tolist() == [10, 4, 1, 2]  # mode 3 is none; 2 is nearest
+        assert out.cv.tolist() == [10 + 4 + 100 + 2000, 1]
+        out = plant.step([-1.0, 1.5, 0.49, 1e9])
+        assert out.mv.tolist() == [0, 0, 0, 5]
+        assert out.cv[0] == 5000
 
 
-def test_validator_finds_nothing(path):
-    assert validate_fmu(path) == []
+def test_disturbances_are_changes_from_what_their_variables_start_with(path):
+    with FmuPlant(path, ["u"], ["sum"], {"n": 3, "bias": 0.5, "mode": "auto"}, dt=10.0) as plant:
+        assert plant.disturbance_names == ("n", "bias", "mode")
+        assert plant.init().cv == 2003.5
+        assert plant.step([1.0], [1.6, -0.25, 3.0]).cv == 1 + 5 + 0.25 + 5000
+        assert plant.step([1.0], 0.0).cv == 2004.5
 
 
-def test_variables_have_the_names_of_the_thesis_and_units(path):
-    description = fmpy.read_model_description(str(path))
-    variables = {v.name: v for v in description.modelVariables}
-    for name, unit in (("choke", "%"), ("gas_lift", "m3/h"), ("reservoir_pressure_offset", "bar")):
-        assert variables[name].causality == "input"
-        assert variables[name].unit == unit
-    assert variables["SepticControl"].type == "Boolean"
-    assert variables["SepticControl"].start == "false"
-    assert {v.name for v in description.modelVariables if v.causality == "output"} >= {"gas_rate", "oil_rate"}
+def test_every_type_of_fmi_3_is_set_and_the_end_that_an_fmu_asks_for_is_told(tmp_path):
+    path = fmus.make_fmu3(tmp_path)
+    largest = {"Int8": 2**7 - 1, "UInt8": 2**8 - 1, "Int16": 2**15 - 1, "UInt16": 2**16 - 1}
+    largest |= {"Int32": 2**31 - 1, "UInt32": 2**32 - 1, "Boolean": 1}
+    with FmuPlant(
+        path, [*largest, "Float64", "Float32", "Int64", "UInt64", "mode"], ["sum"], dt=10.0
+    ) as plant:
+        out = plant.step([*[1e12] * len(largest), 0.1, 0.5, -3.4, -2.0, 7.0]) if plant.init() else None
+        assert out.mv.tolist() == [*largest.values(), 0.1, 0.5, -3, 0, 2]
+        assert out.cv == pytest.approx(sum(largest.values()) + 0.6 - 3 + 2)
+        low = plant.step([*[-1e12] * len(largest), 0.0, 0.0, 0.0, 0.0, 0.0])
+        assert low.mv.tolist() == [-(2**7), 0, -(2**15), 0, -(2**31), 0, 0, 0, 0, 0, 0, 1]
+        for _ in range(3):
+            plant.step(low.mv)
+        with pytest.raises(
+            PlantError, match=r"during doStep at t = 50 s: it asks for the end of the simulation"
+        ):
+            plant.step(low.mv)
 
 
-def test_every_function_of_the_standard_is_exported(path, tmp_path):
-    fmi = 3 if "fmi3" in path.name else 2
-    header = Path(fmpy.__file__).parent / "c-code" / f"fmi{fmi}Functions.h"
-    names = re.findall(rf"^\s*FMI{fmi}_Export\s+\w+\s+(fmi{fmi}\w+);", header.read_text(), flags=re.MULTILINE)
-    assert len(names) > 40
-    fmpy.extract(str(path), str(tmp_path))
-    library = ctypes.cdll.LoadLibrary(str(next(tmp_path.glob("binaries/*/*.so"))))
-    assert [name for name in names if not hasattr(library, name)] == []
+def test_start_values_and_parameters_hold_from_the_first_moment_in_every_run_and_can_be_replaced(path):
+    start = {"gain": 2.0, "mode": "manual", "b": True, "level": 7.0}
+    with FmuPlant(path, ["u"], ["sum", "level"], dt=10.0, start=start) as plant:
+        for _ in range(2):
+            assert plant.init().cv.tolist() == [2 * 5100, 7]
+            assert plant.step([1.0]).cv.tolist() == pytest.approx([2 * 5101, 7 + (2 * 5101 - 7) / 6])
+        with pytest.raises(InputError, match=r"plant.gain: got 11.0, expected a number from 0 to 10"):
+            plant.replaced({"gain": 11.0})
+        with pytest.raises(InputError, match=r"plant.level: .* a parameter of the plant: gain, bias"):
+            plant.replaced({"level": 1.0})
+        assert [(p.name, p.default) for p in plant.parameter_table] == [("gain", 2.0), ("bias", 0.0)]
+        with plant.replaced({"gain": 3.0}) as other, plant.replaced({}) as same:
+            assert other.init().cv.tolist() == [3 * 5100, 7]
+            assert plant.step([1.0]).cv[0] == 2 * 5101
+            assert same.facts() == plant.facts()
+            assert other.facts()["hash"] != plant.facts()["hash"]
+            assert plant.facts()["kind"] == "fmu"
 
 
-def test_generated_source_multiplies_instead_of_calling_pow():
-    header = fmu_files(2, WellParameters())[0]["sources/model.h"]
-    assert "pow(" not in header
-    assert header.count("const double t") > 20  # common subexpressions
+def test_a_plant_settles_at_its_working_point_before_it_is_handed_over(path):
+    point = {"u": 6.0, "mode": "off"}
+    with FmuPlant(path, ["u", "mode"], ["level"], dt=10.0, working_point=point, settle=3600.0) as plant:
+        out = plant.init()
+        assert out.mv.tolist() == [6, 0]
+        assert out.cv == pytest.approx(6.0, rel=1e-9)
+        assert plant.step(out.mv).cv == pytest.approx(6.0, rel=1e-9)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_fmu_agrees_with_the_jax_plant(plant, seed):
-    # Even seeds cover the whole box with shut-ins; odd ones stay where the well swings.
-    limits = {} if seed % 2 == 0 else {"lift_high": 2000.0}
-    demands, offsets = random_demands(np.random.default_rng(seed), 1, 800, **limits)
-    _, expected = run(PLANT.init(), demands[0], offsets[0])
-    expected = jax.tree.map(np.asarray, expected)
-    plant.init()
-    for i, (mv, offset) in enumerate(zip(demands[0], offsets[0], strict=True)):
-        outputs = plant.step(mv, offset)
-        for a, b in zip(outputs, expected, strict=True):
-            np.testing.assert_allclose(a, b[i], rtol=1e-9, atol=1e-9)
-
-
-def test_fmu_agrees_from_any_state(plant):
-    x = np.array(SHIPPED_STEADY_STATE) * np.random.default_rng(3).uniform(0.7, 1.3, 8)
-    mv = np.array([35.0, 1500.0])
-    state, expected = jax.jit(PLANT.step)(WellState(*map(np.asarray, (x, mv[0], mv[1]))), mv)
-    plant.init(*mv, x=x)
-    np.testing.assert_allclose(plant.step(mv).cv, expected.cv, rtol=1e-12)
-    np.testing.assert_allclose(plant.x, state.x, rtol=1e-12)
-
-
-def test_step_choke_moves_alike_on_both_plants(path):
-    demands = np.cumsum(np.random.default_rng(4).uniform(-1.5, 1.5, 200)) + 50.0
-    mv = np.stack([demands, np.full(200, 7000.0)], axis=-1)
-    _, expected = run_stepped(PLANT.init(), mv)
-    with FmuPlant(path, actuator="step") as plant:
-        positions = [plant.step(row).mv[0] for row in mv]
-    np.testing.assert_array_equal(positions, expected.mv[:, 0])
-    assert len(set(positions)) > 3
-
-
-def test_settling_elsewhere_finds_the_steady_state(plant):
-    outputs = plant.init(20.0, 5000.0, -2.0)
-    assert plant.settled
-    expected = steady_state_of(20.0, 5000.0, -2.0, WellParameters())
-    np.testing.assert_allclose(outputs.cv, expected.outputs.cv, rtol=1e-8)
-
-
-def test_init_repeats_a_run_exactly(plant):
-    demands, offsets = random_demands(np.random.default_rng(11), 1, 50)
-    runs = []
-    for _ in range(2):
+def test_an_output_of_the_fmu_can_tell_where_an_actuator_stands(path):
+    with FmuPlant(path, ["n", "u"], ["sum"], dt=10.0, positions={"u": "level"}) as plant:
         plant.init()
-        steps = [plant.step(mv, d).cv for mv, d in zip(demands[0], offsets[0], strict=True)]
-        runs.append(np.array(steps))
-    np.testing.assert_array_equal(*runs)
+        assert plant.step([1.0, 6.0]).mv.tolist() == [1.0, pytest.approx(7.0 / 6)]
 
 
-def test_built_in_sequence_drives_the_well_until_septic_control_is_set(path):
-    result = fmpy.simulate_fmu(
-        str(path),
-        stop_time=16000.0,
-        step_size=10.0,
-        output_interval=10.0,
-        output=["oil_rate", "choke_opening"],
-    )
-    starts = np.array([row[0] for row in INPUT_SEQUENCE])
-    which = np.searchsorted(starts, result["time"][:-1] + 1e-6, side="right") - 1
-    demands = np.array(INPUT_SEQUENCE)[which, 1:]
-    _, expected = run(PLANT.init(), demands, np.zeros(len(demands)))
-    np.testing.assert_allclose(result["oil_rate"][1:], expected.cv[:, 1], rtol=1e-9)
-    held = fmpy.simulate_fmu(
-        str(path),
-        stop_time=2000.0,
-        output_interval=10.0,
-        start_values={"SepticControl": True},
-        output=["oil_rate"],
-    )
-    np.testing.assert_allclose(held["oil_rate"], held["oil_rate"][0], rtol=1e-9)
+# ------------------------------------------------------------------------------------------------------- its steps
 
 
-def test_fmu_state_is_saved_serialised_and_restored(path, tmp_path):
-    fmi = 3 if "fmi3" in path.name else 2
-    fmu = loaded(path, tmp_path)
-    names = {2: ("FMUstate", "deSerializeFMUstate"), 3: ("FMUState", "deserializeFMUState")}[fmi]
-    get, set_, free = (getattr(fmu, f"{verb}{names[0]}") for verb in ("get", "set", "free"))
-    serialise, restore = getattr(fmu, f"serialize{names[0]}"), getattr(fmu, names[1])
-    references = {v.name: v.valueReference for v in fmpy.read_model_description(str(path)).modelVariables}
-    read, write = (fmu.getFloat64, fmu.setFloat64) if fmi == 3 else (fmu.getReal, fmu.setReal)
-    time = 0.0
-
-    def step(mv):
-        nonlocal time
-        write([references["choke"], references["gas_lift"]], mv)
-        fmu.doStep(time, 10.0)
-        time += 10.0
-        return read([references["gas_rate"], references["oil_rate"]])
-
-    fmu.setBoolean([references["SepticControl"]], [True])
-    step([40.0, 6000.0])
-    saved, then = get(), time
-    stored = serialise(saved)
-    first = step([60.0, 9000.0])
-    step([0.0, 0.0])
-    set_(saved)
-    time = then
-    assert step([60.0, 9000.0]) == first
-    again = restore(stored)
-    set_(again)
-    time = then
-    assert step([60.0, 9000.0]) == first
-    free(saved)
-    free(again)
-    fmu.terminate()
-    fmu.freeInstance()
+@pytest.mark.parametrize(
+    ("attributes", "step", "substep", "steps"),
+    [
+        (VARIES, None, None, 1),
+        (VARIES, 0.5, None, 20),
+        (VARIES, 0.3, None, 34),  # 33.3 of them would be too long
+        (VARIES, 0.5, 2.5, 4),
+        (VARIES, 60.0, None, 1),
+        ("", None, None, 1),
+        ("", 0.1, None, 100),
+    ],
+)
+def test_a_sample_is_made_of_the_steps_of_the_fmu(tmp_path, attributes, step, substep, steps):
+    experiment = "" if step is None else f'stepSize="{step}"'
+    path = fmus.make_fmu(tmp_path, fmus.describe(attributes=attributes, experiment=experiment))
+    with FmuPlant(path, ["u"], ["steps", "time"], dt=10.0, substep=substep) as plant:
+        plant.init()
+        for k in (1, 2):
+            assert plant.step([0.0]).cv.tolist() == [k * steps, pytest.approx(k * 10.0, rel=1e-14)]
 
 
-def loaded(path, folder):
-    """The FMU in this process, initialised, with everything that its standard offers."""
-    description = fmpy.read_model_description(str(path))
-    slave = FMU3Slave if description.fmiVersion.startswith("3") else FMU2Slave
-    fmu = slave(
-        guid=description.guid,
-        unzipDirectory=str(fmpy.extract(str(path), str(folder))),
-        modelIdentifier=description.coSimulation.modelIdentifier,
-        instanceName="well",
-    )
-    fmu.instantiate()
-    fmu.enterInitializationMode()
-    fmu.exitInitializationMode()
-    return fmu
+def test_an_fmu_that_ends_with_its_default_experiment_says_so_and_goes_on_when_it_is_told_another_end(
+    tmp_path,
+):
+    path = fmus.make_fmu(tmp_path, fmus.describe(attributes=VARIES, experiment='stopTime="16"'), ends="16")
+    with FmuPlant(path, ["u"], ["sum"], dt=4.0) as plant:
+        plant.init()
+        for _ in range(4):
+            plant.step([0.0])
+        with pytest.raises(PlantError, match=r"t = 16 s: .*experiment ends at 16 s: give a later stop_time"):
+            plant.step([0.0])
+    with FmuPlant(path, ["u"], ["time"], dt=4.0, stop_time=1e6) as plant:
+        plant.init()
+        assert [plant.step([0.0]).cv for _ in range(10)][-1] == 40.0
 
 
-def test_2000_consecutive_runs_leak_nothing(plant):
-    demands = np.random.default_rng(12).uniform((0, 0), (100, 10000), (10, 2))
-
-    def runs(count):
-        for _ in range(count):
-            plant.init()
-            for mv in demands:
-                plant.step(mv)
-        gc.collect()
-        return resident_bytes() + resident_bytes(plant._fmu._process.pid)
-
-    before = runs(200)
-    assert runs(2000) - before < 2e6  # bytes: less than 1 kB per run
+# -------------------------------------------------------------------------------------------------- what is refused
 
 
-def test_loading_and_closing_leaves_neither_files_nor_processes_open(path):
-    def load(count):
-        for _ in range(count):
-            with FmuPlant(path) as plant:
-                folder = plant._fmu.folder
-                assert folder.is_dir()
-            assert not folder.exists()
-        gc.collect()
-        return len(os.listdir("/proc/self/fd")), len(os.listdir("/proc/self/task"))
-
-    before = load(2)
-    assert load(5) == before
-    with FmuPlant(path) as plant:
-        plant.close()
-        with pytest.raises(InputError, match="closed"):
-            plant.step([50.0, 7500.0])
-
-
-def test_a_second_build_builds_nothing(path, monkeypatch, tmp_path):
-    fmi = 3 if "fmi3" in path.name else 2
-
-    def refuse(*_):
-        raise AssertionError("built again")
-
-    monkeypatch.setattr(fmu_module, "_compiled", refuse)
-    assert build_fmu(fmi) == path
-    copy = build_fmu(fmi, tmp_path / "copy.fmu")
-    assert copy.read_bytes() == path.read_bytes()
-    with pytest.raises(AssertionError, match="built again"):
-        build_fmu(fmi, parameters=WellParameters(reservoir_pressure=81e5))
-
-
-@pytest.mark.parametrize("how", ["cut off", "garbage", "one bit", "empty", "another archive"])
-def test_a_damaged_fmu_in_the_cache_is_built_anew_and_named(monkeypatch, tmp_path, capsys, how):
-    monkeypatch.setenv("JAXMPC_CACHE", str(tmp_path))
-    archive = io.BytesIO()
-    with zipfile.ZipFile(archive, "w") as zipped:
-        zipped.writestr("modelDescription.xml", "<fmiModelDescription/>")
-    monkeypatch.setattr(fmu_module, "_compiled", lambda contents: archive.getvalue())
-    cached = build_fmu()
-    sound = cached.read_bytes()
-    assert zipfile.ZipFile(cached).testzip() is None
-    assert build_fmu() == cached
-    assert capsys.readouterr().err == ""
-    middle = len(sound) // 2
-    cached.write_bytes(
-        {
-            "cut off": sound[:middle],
-            "garbage": b"garbage",
-            "one bit": sound[:middle] + bytes([sound[middle] ^ 1]) + sound[middle + 1 :],
-            "empty": b"",
-            "another archive": archive.getvalue(),
-        }[how]
-    )
-    assert build_fmu(out=tmp_path / "copy.fmu").read_bytes() == sound
-    assert cached.read_bytes() == sound
-    assert capsys.readouterr().err == f"jaxmpc: {cached} is damaged; it is made anew\n"
+@pytest.mark.parametrize(
+    ("change", "field", "reason"),
+    [
+        ({"mv": ["uu"]}, "plant.mv", "Did you mean u"),
+        ({"mv": ["sum"]}, "plant.mv", "an input or a tunable parameter .*this is Real, continuous output"),
+        ({"mv": ["gain"]}, "plant.mv", "this is Real, fixed parameter"),
+        ({"mv": []}, "plant.mv", "names of variables"),
+        ({"mv": ["u", "u"]}, "plant.mv", "each once"),
+        ({"mv": {"u": (1.0, 0.0)}}, "plant.mv.u", "low below high"),
+        ({"cv": ["summ"]}, "plant.cv", "Did you mean sum"),
+        ({"cv": ["u"]}, "plant.cv", "an output or a local variable"),
+        ({"cv": ["text"]}, "plant.cv", "that holds a number .*String"),
+        ({"cv": "sum"}, "plant.cv", "names of variables"),
+        ({"disturbances": ["u"]}, "plant.disturbances", "that is no MV"),
+        ({"disturbances": {"n": 1.5}}, "plant.disturbances.n", "a whole number from -2147483648"),
+        ({"start": {"gian": 1.0}}, "plant.start", "Did you mean gain"),
+        ({"start": {"sum": 1.0}}, "plant.start", "a start value or a parameter"),
+        ({"start": {"gain": 11.0}}, "plant.start.gain", "a finite number from 0 to 10"),
+        ({"start": {"mode": "on"}}, "plant.start.mode", "one of off, auto, manual"),
+        ({"start": {"b": "yes"}}, "plant.start.b", "true or false"),
+        ({"working_point": {"n": 1}}, "plant.working_point", "one of the MVs u"),
+        ({"working_point": {"u": math.nan}}, "plant.working_point.u", r"a finite number \[m3/h\]"),
+        ({"positions": {"u": "n"}}, "plant.positions", "an output"),
+        ({"dt": 0.0}, "plant.dt", "seconds"),
+        ({"dt": 10.05}, "plant.dt", "whole number of steps of 0.1 s"),
+        ({"substep": 3.0}, "plant.substep", "divides dt, 10 s"),
+        ({"settle": -1.0}, "plant.settle", "0 or more"),
+        ({"stop_time": 0.0}, "plant.stop_time", "seconds"),
+    ],
+)
+def test_a_plant_that_the_fmu_cannot_be_is_refused_before_anything_of_the_fmu_runs(
+    tmp_path, change, field, reason
+):
+    crash = "__attribute__((constructor)) static void f(void) { abort(); }"
+    path = fmus.make_fmu(tmp_path, fmus.describe(experiment='stepSize="0.1"'), on_load=crash)
+    given = {"mv": ["u"], "cv": ["sum"], "dt": 10.0} | change
+    with pytest.raises(InputError, match=reason) as caught:
+        FmuPlant(path, **given)
+    assert caught.value.field == field
 
 
-def test_an_fmu_of_other_parameters_starts_in_their_steady_state(path, monkeypatch, tmp_path):
-    monkeypatch.setenv("JAXMPC_CACHE", str(tmp_path))
-    parameters = WellParameters(reservoir_pressure=80e5)
-    with FmuPlant(build_fmu(2, tmp_path / "other.fmu", parameters)) as plant:
-        first = plant.measure().cv
-        np.testing.assert_allclose(plant.step([50.0, 7500.0]).cv, first, rtol=1e-9)
-        expected = steady_state_of(50.0, 7500.0, 0.0, parameters).outputs.cv
-        np.testing.assert_allclose(first, expected, rtol=1e-9)
-
-
-def test_missing_tools_are_named_and_the_jax_well_still_runs(monkeypatch, tmp_path):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setenv("JAXMPC_CACHE", str(tmp_path / "cache"))
-    monkeypatch.delenv("CC", raising=False)
-    with pytest.raises(MissingToolError, match=r"a C compiler.*apt install gcc"):
-        build_fmu()
-    assert not [file for file in (tmp_path / "cache").rglob("*") if file.is_file()]
-    assert np.isfinite(jax.jit(PLANT.step)(PLANT.init(), np.array([50.0, 7500.0]))[1].cv).all()
-
-
-def test_a_c_compiler_and_the_python_package_of_cmake_are_enough(path, monkeypatch, tmp_path):
-    pytest.importorskip("cmake")
-    tools = tmp_path / "bin"
-    tools.mkdir()
-    for tool in ("make", "ld", "as", "ar", "ranlib", "uname", "sh"):
-        found = fmu_module.shutil.which(tool)
-        if found:
-            (tools / tool).symlink_to(found)
-    compiler = fmu_module.shutil.which("gcc") or fmu_module.shutil.which("cc")
-    # A gcc without its C++ half, as on a machine where only gcc was installed.
-    (tools / "gcc").write_text(
-        f'#!/bin/sh\ncase "$*" in *.cpp*|*.cxx*) exit 1;; esac\nexec {compiler} "$@"\n'
-    )
-    (tools / "gcc").chmod(0o755)
-    monkeypatch.setenv("PATH", str(tools))
-    monkeypatch.setenv("JAXMPC_CACHE", str(tmp_path / "cache"))
-    monkeypatch.delenv("CC", raising=False)
-    monkeypatch.delenv("CXX", raising=False)
-    fmi = 3 if "fmi3" in path.name else 2
-    built = build_fmu(fmi)
-    assert validate_fmu(built) == []
-    with FmuPlant(built) as plant:
-        np.testing.assert_allclose(plant.measure().cv, [11012.70003, 185.004338], rtol=1e-8)
-
-
-@pytest.mark.slow
-def test_concurrent_builds_leave_one_sound_fmu(path, tmp_path):
-    environment = {**os.environ, "JAXMPC_CACHE": str(tmp_path)}
-    code = "from identify.fmu import build_fmu; print(build_fmu())"
-    runs = [
-        subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
-        for _ in range(3)
-    ]
-    paths = {run.communicate(timeout=300)[0].strip() for run in runs}
-    assert all(run.returncode == 0 for run in runs)
-    assert len(paths) == 1
-    assert validate_fmu(paths.pop()) == []
-    assert len(list((tmp_path / "fmu").iterdir())) == 1
+def test_an_array_is_refused_with_its_size(tmp_path):
+    with pytest.raises(InputError, match=r"a variable with one value \(it is an array of 2\)"):
+        FmuPlant(fmus.make_fmu3(tmp_path), ["row"], ["sum"], dt=1.0)
 
 
 @pytest.mark.parametrize(
     ("call", "field"),
     [
-        (lambda p: p.step([50.0, float("nan")]), "mv"),
-        (lambda p: p.step([50.0]), "mv"),
-        (lambda p: p.step([50.0, 7500.0], float("inf")), "reservoir_pressure_offset"),
-        (lambda p: p.init(choke=200.0), "choke"),
-        (lambda p: p.init(lift=-1.0), "gas_lift"),
-        (lambda p: p.init(x=[1.0, 2.0]), "x"),
+        (lambda p: p.step([1.0, math.nan]), "mv"),
+        (lambda p: p.step([1.0]), "mv"),
+        (lambda p: p.step([1.0, 2.0], [math.inf]), "bias"),
+        (lambda p: p.step([1.0, 2.0], [1.0, 2.0]), "disturbance"),
     ],
 )
-def test_bad_input_is_refused_by_name_and_moves_nothing(plant, call, field):
-    plant.step([45.0, 7000.0])
-    before = plant.x
-    with pytest.raises(InputError) as caught:
-        call(plant)
-    assert caught.value.field == field
-    np.testing.assert_array_equal(plant.x, before)
+def test_bad_demands_and_disturbances_are_refused_and_move_nothing(path, call, field):
+    with FmuPlant(path, ["u", "n"], ["sum", "time"], ["bias"], dt=10.0) as plant:
+        with pytest.raises(InputError, match="after init"):
+            plant.step([1.0, 2.0])
+        plant.init()
+        before = plant.step([1.0, 2.0])
+        with pytest.raises(InputError) as caught:
+            call(plant)
+        assert caught.value.field == field
+        assert plant.measure().cv.tolist() == before.cv.tolist()
+        assert plant.measure().mv.tolist() == [1.0, 2.0]
 
 
 @pytest.mark.parametrize(
-    ("call", "field"),
+    ("code", "reason"),
     [
-        (lambda folder: build_fmu(1), "fmi"),
-        (lambda folder: build_fmu(2, folder), "out"),
-        (lambda folder: build_fmu(2, folder / "well.zip"), "out"),
-        (lambda folder: build_fmu(parameters=WellParameters(molar_mass=0.0)), "well.molar_mass"),
-        (lambda folder: FmuPlant(folder / "none.fmu"), "plant.path"),
-        (lambda folder: FmuPlant(folder / "text.fmu"), "plant.path"),
-        (lambda folder: FmuPlant(actuator="other"), "plant.actuator"),
-        (lambda folder: FmuPlant(dt=0.0), "plant.dt"),
+        ("if (t == 20) { r[4] = NAN; }", "the FMU gives nan for sum"),
+        ("if (t == 20) { abort(); }", "ended its process with signal SIGABRT during doStep at t = 20 s"),
+        ("if (t == 20) { for (;;); }", "did not come back from doStep at t = 20 s within 1 s"),
     ],
 )
-def test_bad_builds_and_files_are_refused_by_name(tmp_path, call, field):
-    (tmp_path / "text.fmu").write_text("not a zip file")
-    with pytest.raises(InputError) as caught:
-        call(tmp_path)
-    assert caught.value.field == field
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["text.fmu"]
+def test_an_fmu_that_fails_during_a_run_is_a_plant_that_fails(tmp_path, code, reason):
+    path = fmus.make_fmu(tmp_path, fmus.describe(attributes=VARIES), do_step=code)
+    with FmuPlant(path, ["u"], ["sum"], dt=10.0, time_limit=1.0) as plant:
+        plant.init()
+        plant.step([0.0])
+        plant.step([0.0])
+        with pytest.raises(PlantError, match=reason):
+            plant.step([0.0])
 
 
-def test_token_is_a_digest_of_the_sources():
-    tokens = {fmu_files(fmi, WellParameters(gas_oil_ratio=g))[1] for fmi in (2, 3) for g in (26.0, 27.0)}
-    assert len(tokens) == 4
+# ------------------------------------------------------------------------------------------------------ what is told
+
+
+def test_fmu_info_lists_what_an_fmu_is_without_loading_it(tmp_path, capsys):
+    experiment = 'startTime="0" stopTime="16" stepSize="0.1"'
+    crash = "__attribute__((constructor)) static void f(void) { abort(); }"
+    description = fmus.describe("ModelExchange", experiment=experiment)
+    assert main(["fmu", "info", str(fmus.make_fmu(tmp_path, description, on_load=crash))]) == 0
+    told = capsys.readouterr().out
+    lines = [" ".join(line.split()) for line in told.splitlines()]
+    assert "FMI 2.0, model exchange" in lines
+    assert "experiment start 0 s, stop 16 s, step 0.1 s" in lines
+    assert "u Real m3/h input continuous 0" in lines
+    assert "mode Enumeration input discrete 0 (off) 0 off, 2 auto, 5 manual" in lines
+    assert "gain Real parameter fixed 1 0..10" in lines
+    assert "bias Real parameter tunable 0 added to the sum" in lines
+    assert main(["fmu", "info", str(fmus.make_fmu3(tmp_path))]) == 0
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert "row Float64[2] input continuous 0 0" in lines
+    assert "steps all of one size, its own are of 0.5 s" in lines
+
+
+def test_fmu_info_of_what_is_no_fmu_ends_with_status_two_and_one_line(tmp_path, capsys):
+    (tmp_path / "text.fmu").write_text("text")
+    assert main(["fmu", "info", str(tmp_path / "text.fmu")]) == 2
+    out, error = capsys.readouterr()
+    assert out == ""
+    assert error.startswith("jaxmpc: FMU: got")
+    assert error.count("\n") == 1

@@ -18,6 +18,7 @@ from identify import fmu_worker
 from identify.fmu import FmuPlant
 from identify.fmu_process import FmuProcess
 from identify.fmu_worker import RefusedError, check_archive
+from identify.well_fmu import WellFmuPlant
 from jaxmpc.errors import InputError, PlantError
 from tests import fmus
 
@@ -51,9 +52,9 @@ def wait_until(condition, what):
 
 def test_reals_integers_and_booleans_are_set_held_over_the_steps_and_read(tmp_path):
     with FmuProcess(fmus.make_fmu(tmp_path)) as fmu:
-        assert fmu.fmi == 2
-        assert fmu.token == fmus.GUID
-        assert fmu.variables["n"] == ("Integer", "input")
+        assert fmu.description.fmi == 2
+        assert fmu.description.token == fmus.GUID
+        assert fmu.description.variables["n"].type == "Integer"
         fmu.start({"u": 1.5})
         assert fmu.get(["sum", "time"]) == [1.5, 0.0]
         assert fmu.step(10.0, {"u": 0.1 + 0.2, "n": 3, "b": True}, ["time", "sum"]) == [
@@ -151,8 +152,9 @@ def test_an_error_of_the_fmu_is_told_and_a_new_run_may_follow(tmp_path):
     ],
 )
 def test_a_crash_while_an_fmu_is_loaded_is_told(tmp_path, code, what):
-    with pytest.raises(PlantError, match=f"signal SIGABRT during {what}"):
-        FmuProcess(fmus.make_fmu(tmp_path, **code))
+    path = fmus.make_fmu(tmp_path, **code)
+    with FmuProcess(path) as fmu, pytest.raises(PlantError, match=f"signal SIGABRT during {what}"):
+        fmu.load()
 
 
 @pytest.mark.parametrize("code", ["abort();", "exit(3);", "for (;;);"])
@@ -284,6 +286,10 @@ def test_closing_in_the_middle_of_a_call_does_not_wait_for_it(tmp_path):
 # -------------------------------------------------------------------------------------------- files that are refused
 
 
+def plant_of(path):
+    return FmuPlant(path, ["u"], ["sum"], dt=10.0)
+
+
 def archive(folder, **changes):
     """A sound description and a text in the place of the library, with changes to the content."""
     library = f"binaries/{fmpy.platform}/sum{fmpy.sharedLibraryExtension}"
@@ -303,7 +309,7 @@ LIBRARY = f"binaries/{fmpy.platform}/sum{fmpy.sharedLibraryExtension}"
     [
         ({"modelDescription.xml": None}, "an FMU, with a modelDescription.xml"),
         ({"modelDescription.xml": "text"}, "that is XML"),
-        (description("<Real/>", "<Rel/>"), "that follows the standard .*line 10.*'Rel'"),
+        (description("<Real/>", "<Rel/>"), "that follows the standard .*line 13.*'Rel'"),
         (description('fmiVersion="2.0"', 'fmiVersion="1.0"'), r"FMI 2.0 or 3.0 \(its version is 1.0\)"),
         (description("CoSimulation", "ModelExchange"), r"a co-simulation FMU \(it has only: ModelExchange\)"),
         ({LIBRARY: None, "binaries/win32/sum.dll": "x"}, r"a library for \w+ \(it has one for win32\)"),
@@ -324,7 +330,7 @@ LIBRARY = f"binaries/{fmpy.platform}/sum{fmpy.sharedLibraryExtension}"
 def test_a_file_that_is_no_fmu_for_here_is_refused_with_its_reason(tmp_path, content, reason):
     path = archive(tmp_path, more=content)
     with pytest.raises(InputError, match=reason) as caught:
-        FmuPlant(path)
+        plant_of(path)
     assert caught.value.field == "plant.path"
     assert caught.value.value == str(path)
     assert "jaxmpc-fmu-" not in str(caught.value)
@@ -334,24 +340,24 @@ def test_a_file_that_is_no_fmu_for_here_is_refused_with_its_reason(tmp_path, con
 def test_a_library_of_another_guid_is_refused_with_its_reason(tmp_path):
     path = fmus.make_fmu(tmp_path, fmus.describe(guid="{another}"))
     with pytest.raises(InputError, match=r"the GUID \{another\} of its description is not in its library"):
-        FmuPlant(path)
+        plant_of(path)
 
 
 def test_a_library_that_declines_is_refused(tmp_path):
     path = fmus.make_fmu(tmp_path, instantiate="if (type == 1) return 0")
     with pytest.raises(InputError, match=r"lets itself be instantiated \(it declined\)"):
-        FmuPlant(path)
+        plant_of(path)
 
 
 def test_a_library_without_a_function_of_the_standard_is_refused_by_its_name(tmp_path):
     path = fmus.make_fmu(tmp_path, without="fmi2CancelStep")
     with pytest.raises(InputError, match=r"every function of FMI 2 \(fmi2CancelStep is missing\)"):
-        FmuPlant(path)
+        plant_of(path)
 
 
 def test_an_fmu_of_something_else_is_refused_with_the_variables_that_it_lacks(tmp_path):
     with pytest.raises(InputError, match=r"an FMU of the well \(without choke, gas_lift, .* it is not\)"):
-        FmuPlant(fmus.make_fmu(tmp_path))
+        WellFmuPlant(fmus.make_fmu(tmp_path))
 
 
 def test_an_archive_that_is_damaged_inside_is_refused(tmp_path):
@@ -361,14 +367,14 @@ def test_an_archive_that_is_damaged_inside_is_refused(tmp_path):
     content[start : start + 20] = bytes(20)
     path.write_bytes(content)
     with pytest.raises(InputError, match="an undamaged FMU"):
-        FmuPlant(path)
+        plant_of(path)
 
 
 def test_an_archive_that_is_cut_off_is_refused(tmp_path):
     path = archive(tmp_path)
     path.write_bytes(path.read_bytes()[:-30])
     with pytest.raises(InputError, match="a readable FMU, which is a zip archive"):
-        FmuPlant(path)
+        plant_of(path)
 
 
 def test_a_symbolic_link_is_refused(tmp_path):
@@ -378,7 +384,7 @@ def test_a_symbolic_link_is_refused(tmp_path):
     with zipfile.ZipFile(path, "a") as more:
         more.writestr(link, "/etc/hostname")
     with pytest.raises(InputError, match=r"without symbolic links \('resources/link' is one\)"):
-        FmuPlant(path)
+        plant_of(path)
 
 
 def test_an_archive_larger_than_allowed_or_than_the_disk_is_refused(tmp_path, monkeypatch):

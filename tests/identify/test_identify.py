@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from identify.fit import StepData, fit_well, load_step_data, main
-from identify.fmu import FmuPlant
 from identify.step_test import identify_step_response, settling, settling_notes
 from identify.sweep import steady_sweep
+from identify.well_fmu import WellFmuPlant
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.well.equations import WellParameters, load_parameters, parameters_to_dict
@@ -34,7 +34,7 @@ def sweep():
 @pytest.fixture(scope="module")
 def fmu():
     try:
-        plant = FmuPlant()
+        plant = WellFmuPlant()
     except MissingToolError as error:
         pytest.skip(str(error))
     with plant:

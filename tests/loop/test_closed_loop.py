@@ -50,11 +50,11 @@ def controller_of(kind, model):
     ],
 )
 def test_the_fmu_and_the_jax_well_close_the_same_loop(model, kind, actuator):
-    from identify.fmu import FmuPlant
+    from identify.well_fmu import WellFmuPlant
 
     controller = controller_of(kind, model)
     twin = simulate(controller, WellPlant(actuator=actuator), TO_30_PERCENT)
-    with FmuPlant(actuator=actuator) as fmu:
+    with WellFmuPlant(actuator=actuator) as fmu:
         real = simulate(controller, fmu, TO_30_PERCENT)
     # the plants agree to 1e-9; a continuous solve repeats to about 1e-6 of a move limit
     np.testing.assert_allclose(real.mv, twin.mv, atol=1e-2 if actuator == "continuous" else 0.05)

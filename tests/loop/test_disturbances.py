@@ -1,5 +1,7 @@
 """Measured disturbances and known setpoints in closed loops, on a plant that is the model itself."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -11,14 +13,15 @@ from jaxmpc.model.step_response import make_model
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import make_tuning
 from jaxmpc.process.host import HostPlant
-from tests.itself import Itself
+from jaxmpc.process.model_plant import ModelPlant
 
 SAMPLES, DT = 70, 10.0  # more than one call of the longest length
 LEVEL, VALVE = np.array([50.0]), np.array([40.0, 30.0])
 
 
-def plant_of(model, names=("drift", "inflow")):
-    return Itself(model, LEVEL, VALVE, disturbance_names=names)
+def plant_of(model):
+    """The model itself: its disturbances are the DV of the model, and what is added to the CV without being measured."""
+    return ModelPlant(model, start={"level": 50.0, "valve": 40.0, "heater": 30.0})
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +55,7 @@ def controllers(models):
 
 def disturbed(size=12.0, at=20):
     rows = np.zeros((SAMPLES, 2))
-    rows[at:, 1] = size
+    rows[at:, 0] = size
     return rows
 
 
@@ -92,7 +95,7 @@ def test_a_setpoint_that_is_known_ahead_is_met_halfway(controllers, models):
 def test_compiled_loops_host_loops_batches_and_single_steps_agree(models, controllers, preview):
     plant, one = plant_of(models[1]), controllers[1]
     rows = disturbed()
-    rows[40:, 0] = 0.7  # this one is not measured
+    rows[40:, 1] = 0.7  # this one is not measured
     how = dict(disturbance=rows, preview=preview)
     compiled, stepped = simulate(one, plant, UP, **how), simulate(one, HostPlant(plant), UP, **how)
     others = np.stack([disturbed(-6.0, 10), rows])
@@ -100,7 +103,7 @@ def test_compiled_loops_host_loops_batches_and_single_steps_agree(models, contro
     _, lane = simulate_batch(lanes, plant, UP, disturbance=others, preview=preview)
     setpoint, horizon = UP.sample(DT), STRUCTURE.prediction_horizon
     whole = lambda v: np.concatenate([v, np.repeat(v[-1:], horizon + 1, axis=0)])  # noqa: E731
-    setpoints, dvs = whole(setpoint), whole(rows[:, 1:])
+    setpoints, dvs = whole(setpoint), whole(rows[:, :1])
     state, process, demands = one.init(LEVEL, VALVE), HostPlant(plant), []
     outputs = process.init()
     for k in range(SAMPLES):
@@ -115,7 +118,7 @@ def test_compiled_loops_host_loops_batches_and_single_steps_agree(models, contro
 
 
 def test_a_disturbance_that_the_plant_lacks_is_refused(models, controllers):
-    plant = plant_of(models[1], ("drift", "outflow"))
+    plant = plant_of(dataclasses.replace(models[1], dv_names=("outflow",)))
     for run in (simulate, simulate_batch):
         with pytest.raises(InputError, match=r"^model\.dv: got 'inflow', expected .*outflow"):
             run(controllers[1], plant, HOLD)

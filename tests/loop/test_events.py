@@ -15,8 +15,8 @@ from jaxmpc.loop.reference import Reference
 from jaxmpc.loop.simulate import simulate, simulate_batch
 from jaxmpc.problem.tuning import make_tuning
 from jaxmpc.process.host import HostPlant
+from jaxmpc.process.model_plant import ModelPlant
 from tests.five_controllers import START
-from tests.itself import Itself
 
 SAMPLES, DT = 80, 10.0
 CV, MV = START
@@ -33,7 +33,7 @@ EXACT = dict(rtol=1e-6, atol=1e-4)  # a continuous solve repeats to about 1e-6 o
 
 @pytest.fixture
 def plant(well_like_model):
-    return Itself(well_like_model, CV, MV)
+    return ModelPlant(well_like_model, start=dict(gas=CV[0], oil=CV[1], choke=MV[0], lift=MV[1]))
 
 
 @pytest.fixture
@@ -102,12 +102,10 @@ def test_a_compiled_loop_with_events_is_the_loop_on_the_host(made, plant):
     np.testing.assert_array_equal(one.finished_by, two.finished_by)
 
 
-@pytest.mark.parametrize("integer", [False, True])
 def test_lanes_with_events_of_their_own_are_each_alone(
-    well_like_model, small_structure, thesis_fields, plant, integer, monkeypatch, compilations
+    well_like_model, small_structure, thesis_fields, plant, monkeypatch, compilations
 ):
-    structure = small_structure if integer else small_structure.relaxed()
-    tuning = make_tuning(structure, **thesis_fields)
+    structure, tuning = small_structure, make_tuning(small_structure, **thesis_fields)
     lists = [EVENTS, (), [Event(300.0, {"soft_linear": 0.0}, mv_off=["choke"])]]
     controller = Controller(structure, tuning, well_like_model)
     monkeypatch.setattr(compiled, "TOGETHER", 2)  # two parts, the last filled up
@@ -190,6 +188,7 @@ def test_setpoints_behind_a_lag_or_a_ramp():
         steps.ramped(np.nan, 10.0)
 
 
+@pytest.mark.slow
 def test_lanes_that_lose_cvs_of_their_own_are_each_alone(
     well_like_model, small_structure, thesis_fields, plant
 ):

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxmpc.errors import InputError
-from jaxmpc.process.actuator import move_choke, step_choke
+from jaxmpc.process.well.choke import CHOKES
 from jaxmpc.process.well.equations import SHIPPED_STEADY_STATE, WellParameters
 from jaxmpc.process.well.plant import WellPlant, WellState, steady_state, steady_state_of
 
@@ -226,17 +226,17 @@ def test_a_start_elsewhere_is_steady():
     ],
 )
 def test_step_choke_moves_to_the_nearest_position_once_1_6_away(position, demand, expected):
-    assert float(step_choke(position, demand)) == expected
-    assert float(step_choke(jnp.asarray(position), jnp.asarray(demand))) == expected
+    assert float(CHOKES["step"].move(position, demand)) == expected
+    assert float(CHOKES["step"].move(jnp.asarray(position), jnp.asarray(demand))) == expected
 
 
 @settings(deadline=None, max_examples=200)
 @given(st.integers(0, 50), st.floats(0, 100))
 def test_step_choke_ends_within_reach_of_the_demand_and_stays_there(start, demand):
-    position = float(step_choke(2.0 * start, demand))
+    position = float(CHOKES["step"].move(2.0 * start, demand))
     assert position % 2.0 == 0.0
     assert abs(position - demand) < 1.6
-    assert float(step_choke(position, demand)) == position
+    assert float(CHOKES["step"].move(position, demand)) == position
 
 
 def test_actuators_are_part_of_the_plant():
@@ -245,7 +245,7 @@ def test_actuators_are_part_of_the_plant():
     _, stepped = jax.jit(PLANT.with_actuator("step").step)(PLANT.init(), mv)
     np.testing.assert_array_equal(continuous.mv, [51.0, 7500.0])
     np.testing.assert_array_equal(stepped.mv, [50.0, 7500.0])
-    assert float(move_choke("continuous", 50.0, 120.0)) == 100.0
+    assert float(CHOKES["continuous"].move(50.0, 120.0)) == 100.0
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxmpc.errors import InputError
+from jaxmpc.process.plant import lanes_of_plants
 from jaxmpc.process.well.equations import (
     SHIPPED_STEADY_STATE,
     STATES,
@@ -20,7 +21,7 @@ from jaxmpc.process.well.equations import (
     save_parameters,
     well_hash,
 )
-from jaxmpc.process.well.plant import JaxOps, rates, steady_state
+from jaxmpc.process.well.plant import JaxOps, WellPlant, rates, steady_state
 
 CHOKES = (4.0, 10.0, 20.0, 30.0, 50.0, 70.0, 100.0)
 LIFTS = (5000.0, 7500.0, 10000.0)
@@ -187,3 +188,33 @@ def test_bad_parameters_are_refused_by_name(body, field):
 def test_every_state_has_a_unit_and_a_text():
     assert len(STATES) == len(SHIPPED_STEADY_STATE)
     assert all(unit and text for _, unit, text in STATES)
+
+
+# ------------------------------------------------------------------------------------------ engineering units
+
+
+def test_parameters_are_listed_in_engineering_units_and_shift_back_to_the_last_bit():
+    table = {p.name: p for p in WellPlant.parameter_table}
+    assert (table["reservoir_pressure"].default, table["reservoir_pressure"].unit) == (78.2901, "bar")
+    assert (table["productivity"].default, table["productivity"].unit) == (2.01723, "kg/s/bar")
+    assert table["gas_meter"].unit == "1"
+    listed = WellPlant().replaced({name: p.default for name, p in table.items()})
+    assert parameters_to_dict(listed.parameters) == parameters_to_dict(WellParameters())
+
+
+def test_replaced_parameters_are_those_of_the_equations():
+    plant = WellPlant(actuator="step").replaced({"reservoir_pressure": 80.1, "choke_linear": -0.5})
+    assert plant.parameters == WellParameters(reservoir_pressure=8010000.0, choke_linear=-0.5)
+    assert plant.actuator == "step"
+    lanes = lanes_of_plants(WellPlant(), {"trip_end": np.array([80.0, 81.3]), "molar_mass": 0.021})
+    np.testing.assert_array_equal(lanes.each.parameters.trip_end, [8000000.0, 8130000.0])
+    assert lanes.count == 2
+    assert lanes.shared.parameters.molar_mass == 0.021
+    assert lanes.shared.parameters.trip_end is None
+    for values, told in {
+        ("reservoir_presure", 80.0): "Did you mean reservoir_pressure",
+        ("reservoir_pressure", -80.0): r"plant.reservoir_pressure: .* positive number \[bar\]",
+        ("trip_start", 90.0): "plant.parameters.trip_start",
+    }.items():
+        with pytest.raises(InputError, match=told):
+            WellPlant().replaced(dict([values]))

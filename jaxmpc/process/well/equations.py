@@ -246,17 +246,19 @@ def model(ops, x: Sequence, u: Sequence, p) -> tuple[list, list]:
     return dx, y
 
 
+SIGNED = frozenset(("choke_linear", "choke_quick", "perforation_depth"))  # parameters that may be negative
+
+
 def check_parameters(parameters: WellParameters, path: str = "well") -> WellParameters:
     """Refuse parameters that are not finite or have no physical meaning.
 
     Raises:
         InputError: naming the first field that is wrong and its unit.
     """
-    signed = {"choke_linear", "choke_quick", "perforation_depth"}
     for field in fields(parameters):
         value = as_floats(f"{path}.{field.name}", getattr(parameters, field.name), "a number")
-        if not np.isfinite(value).all() or (field.name not in signed and not (value > 0).all()):
-            kind = "finite" if field.name in signed else "finite and positive"
+        if not np.isfinite(value).all() or (field.name not in SIGNED and not (value > 0).all()):
+            kind = "finite" if field.name in SIGNED else "finite and positive"
             raise InputError(f"{path}.{field.name}", value.tolist(), f"a {kind} number (SI units)")
     if not np.all(np.asarray(parameters.trip_start) < np.asarray(parameters.trip_end)):
         raise InputError(f"{path}.trip_start", parameters.trip_start, "a pressure [Pa] below trip_end")

@@ -3,12 +3,13 @@
 `WellPlant` integrates the equations of `jaxmpc.process.well.equations` with RK4 between samples, holds its inputs over each
 sample, and moves the choke the way its actuator does. Everything is pure: a batch over states, inputs,
 parameters or disturbances is a `jax.vmap`. The closed loop and the identification call it; the FMU plant of
-`identify.fmu` offers the same steps on the host.
+`identify.well_fmu` offers the same steps on the host.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -19,10 +20,12 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxmpc.check import as_floats, is_number
+from jaxmpc.check import as_floats
 from jaxmpc.errors import InputError
-from jaxmpc.process.actuator import check_actuator, move_choke
-from jaxmpc.process.plant import JaxPlant
+from jaxmpc.process import integration
+from jaxmpc.process.integration import settle, whole_steps
+from jaxmpc.process.plant import JaxPlant, Parameter, checked_parameters
+from jaxmpc.process.well.choke import CHOKES, LIFT, check_choke
 from jaxmpc.process.well.equations import (
     DEFAULT_CHOKE,
     DEFAULT_LIFT,
@@ -31,13 +34,12 @@ from jaxmpc.process.well.equations import (
     check_parameters,
     model,
 )
-from jaxmpc.programs.numerics import largest
+from jaxmpc.process.well.parameters import PARAMETERS, in_si
 
 # Typical sizes of the states, for tolerances [kg, kg, kg, kg, kg, 1, m3/h, Pa].
 STATE_SCALE = (100.0, 100.0, 100.0, 1000.0, 1000.0, 1.0, 1000.0, 1e6)
 STEADY_TOLERANCE = 1e-11  # scaled drift [1/s] below which a state counts as steady
 STEADY_HOURS = 48
-NEWTON_STEPS = 25
 
 
 class JaxOps:
@@ -90,23 +92,8 @@ def rates(x: Float[Array, "8"], u: Float[Array, "3"], parameters: WellParameters
 
 def runge_kutta(x: tuple, u: tuple, parameters: WellParameters, steps, substep: float) -> tuple:
     """Integrate over `steps` classical fourth-order Runge-Kutta steps of `substep` seconds, inputs held."""
-
-    def slope(x):
-        return model(JaxOps, x, u, parameters)[0]
-
-    def ahead(x, k, h):
-        return tuple(a + h * b for a, b in zip(x, k, strict=True))
-
-    def one(_, x):
-        k1 = slope(x)
-        k2 = slope(ahead(x, k1, 0.5 * substep))
-        k3 = slope(ahead(x, k2, 0.5 * substep))
-        k4 = slope(ahead(x, k3, substep))
-        total = (a + 2 * (b + c) + d for a, b, c, d in zip(k1, k2, k3, k4, strict=True))
-        return tuple(a + substep / 6 * k for a, k in zip(x, total, strict=True))
-
     # Eight separate values, not one array: a batch then works on whole vectors instead of strided slices.
-    return jax.lax.fori_loop(0, steps, one, x)
+    return integration.runge_kutta(lambda x: model(JaxOps, x, u, parameters)[0], x, steps, substep)
 
 
 def steady_state(
@@ -116,13 +103,11 @@ def steady_state(
     parameters: WellParameters | None = None,
     guess: Float[Array, "8"] | None = None,
 ) -> SteadyState:
-    """Steady state for held inputs: Newton's method, from states further and further along a simulation.
+    """Steady state for held inputs, see `jaxmpc.process.integration.settle`.
 
-    Newton's method alone is lost between the one-way valves, and simulation alone is slow to finish. A result
-    of Newton's method counts only if it lies near the state it started from. Where the choke is shut or
-    nearly no gas is lifted, steady states are not unique; the result is the one that the simulation from
-    `guess` settles at. A well with other parameters may have an unstable steady state (casing heading), which
-    the simulation circles; the shipped well has none.
+    Where the choke is shut or nearly no gas is lifted, steady states are not unique; the result is the one that
+    the simulation from `guess` settles at. A well with other parameters may have an unstable steady state (casing
+    heading), which the simulation circles; the shipped well has none.
 
     Args:
         choke: position [%], 0..100.
@@ -143,37 +128,16 @@ def steady_state(
     def drift(s):
         return rates(s * scale, u, parameters) / scale
 
-    def size(s):
-        return largest(drift(s))
-
-    def newton_step(count, s):
-        # The growing time step keeps the matrix regular where a state has no unique equilibrium.
-        step = 100.0 * 10.0 ** jnp.minimum(count, 12)
-        return s + jnp.linalg.solve(jnp.eye(8) / step - jax.jacfwd(drift)(s), drift(s))
-
-    def polish(s):
-        new = jax.lax.fori_loop(0, NEWTON_STEPS, newton_step, s)
-        near = largest((new - s) / (jnp.abs(s) + 0.05)) < 0.3
-        return jnp.where(near & (size(new) <= STEADY_TOLERANCE), new, s)
-
-    def unfinished(carry):
-        s, hours = carry
-        return (size(s) > STEADY_TOLERANCE) & (hours < STEADY_HOURS)
-
-    def advance(carry):
-        s, hours = carry
-        s = polish(s)
-        seconds = jnp.where(size(s) <= STEADY_TOLERANCE, 0, 3600)
-        x = runge_kutta(tuple(s * scale), tuple(u), parameters, seconds, 1.0)
-        return jnp.stack(x) / scale, hours + (seconds > 0)
+    def onward(s, wanted):
+        seconds = jnp.where(wanted, 3600, 0)
+        return jnp.stack(runge_kutta(tuple(s * scale), tuple(u), parameters, seconds, 1.0)) / scale
 
     # The two actuator lags are known; the other states start where the guess has them.
     first = (start / scale).at[5].set(u[0] / 100).at[6].set(u[1] / scale[6])
-    s, hours = jax.lax.while_loop(unfinished, advance, (first, jnp.asarray(0)))
-    drifting = size(s)
-    x = s * scale
+    found = settle(drift, onward, first, first_step=100.0, tolerance=STEADY_TOLERANCE, rounds=STEADY_HOURS)
+    x = found.state * scale
     outputs = _outputs(x, u[0], u[1], u[2], parameters)
-    return SteadyState(x, outputs, drifting <= STEADY_TOLERANCE, drifting, hours)
+    return SteadyState(x, outputs, found.drift <= STEADY_TOLERANCE, found.drift, found.rounds)
 
 
 _steady_state = jax.jit(steady_state)
@@ -210,21 +174,26 @@ class WellPlant(JaxPlant):
     """
 
     disturbance_names: ClassVar[tuple[str, ...]] = ("reservoir_pressure_offset",)
+    parameter_table: ClassVar[tuple[Parameter, ...]] = PARAMETERS
     parameters: WellParameters = WellParameters()
     dt: float = eqx.field(static=True, default=10.0)
     substep: float = eqx.field(static=True, default=1.0)
     actuator: str = eqx.field(static=True, default="continuous")
 
     def __check_init__(self):
-        for name in ("dt", "substep"):
-            value = getattr(self, name)
-            if not is_number(value) or value <= 0:
-                raise InputError(f"plant.{name}", value, "a positive number of seconds")
-        if abs(self.dt / self.substep - self.steps) > 1e-9 or self.steps < 1:
-            raise InputError("plant.dt", self.dt, f"a whole number of substeps of {self.substep} s")
-        check_actuator(self.actuator, "plant.actuator")
+        whole_steps(self.dt, self.substep)
+        check_choke(self.actuator, "plant.actuator")
         if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(self.parameters)):
             check_parameters(self.parameters, "plant.parameters")
+
+    def replaced(self, values: Mapping[str, ArrayLike]) -> WellPlant:
+        """The well with other parameters in engineering units, see `JaxPlant.replaced`."""
+        found = checked_parameters(PARAMETERS, values)
+        si = {
+            name: np.array([in_si(name, v) for v in value]) if value.ndim else in_si(name, float(value))
+            for name, value in found.items()
+        }
+        return dataclasses.replace(self, parameters=dataclasses.replace(self.parameters, **si))
 
     @property
     def steps(self) -> int:
@@ -262,8 +231,8 @@ class WellPlant(JaxPlant):
             ``(state, outputs)`` at the end of the sample. Not a number in gives not a number out.
         """
         mv = jnp.asarray(mv, dtype=jnp.float64)
-        position = jnp.asarray(move_choke(self.actuator, state.position, mv[0]))
-        lift = jnp.maximum(mv[1], 0.0)
+        position = CHOKES[self.actuator].move(state.position, mv[0])
+        lift = LIFT.move(state.lift, mv[1])
         offset = jnp.asarray(disturbance, dtype=jnp.float64).reshape(())
         u = (position, lift, offset)
         x = jnp.stack(runge_kutta(tuple(state.x), u, self.parameters, self.steps, self.substep))

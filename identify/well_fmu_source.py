@@ -1,8 +1,8 @@
 """C sources and model description of the well's FMU, generated from the one model function (thesis 3.2.1).
 
 `jaxmpc.process.well.equations.model` is traced with SymPy, common subexpressions are taken out, and the result becomes
-``model.h``. The C files in ``fmu_sources`` add the integration and the FMI 2.0 and 3.0 co-simulation
-interfaces. Nothing here runs a compiler or imports FMPy: see `identify.fmu`.
+``model.h``. The C files in ``well_fmu_sources`` add the integration and the FMI 2.0 and 3.0 co-simulation
+interfaces. Nothing here runs a compiler or imports FMPy: see `identify.well_fmu`.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ INPUT_SEQUENCE = (
     (22200.0, 70.0, 5000.0),
     (29400.0, 50.0, 7500.0),
 )
-# Value references; fmu_sources/well.h has the same numbers.
+# Value references; well_fmu_sources/well.h has the same numbers.
 VR_TIME, VR_INPUT, VR_SEPTIC_CONTROL, VR_OUTPUT, VR_STATE = 0, 1, 10, 20, 40
 UNITS = {
     "1": "",
@@ -195,8 +195,8 @@ def model_description(fmi: int, token: str, parameters: WellParameters) -> str:
 
 
 def _filled(name: str, **words: object) -> str:
-    """A template of ``fmu_sources`` with its words filled in."""
-    return Template((files("identify") / "fmu_sources" / name).read_text("utf-8")).substitute(words)
+    """A template of ``well_fmu_sources`` with its words filled in."""
+    return Template((files("identify") / "well_fmu_sources" / name).read_text("utf-8")).substitute(words)
 
 
 def fmu_files(fmi: int, parameters: WellParameters) -> tuple[dict[str, str], str]:
@@ -206,7 +206,7 @@ def fmu_files(fmi: int, parameters: WellParameters) -> tuple[dict[str, str], str
         ``(files, token)``: contents by path inside the FMU, and the instantiation token, which is a digest of
         those contents.
     """
-    folder = files("identify") / "fmu_sources"
+    folder = files("identify") / "well_fmu_sources"
     contents = {
         f"sources/{name}": (folder / name).read_text() for name in ("well.h", "well.c", f"fmi{fmi}.c")
     }
