@@ -31,6 +31,7 @@ _HOME_OF = {
     "Actuator": "process.actuator",
     "Controller": "controller.controller",
     "Controllers": "controller.controller",
+    "Event": "loop.events",
     "FunctionPlant": "process.function_plant",
     "InputError": "errors",
     "Reference": "process.reference",

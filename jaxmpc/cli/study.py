@@ -249,6 +249,8 @@ def simulate(options: Options) -> int:
     from figures.closed_loop import draw_run
 
     look = {"kind": again.kind, "actuator": again.actuator}
-    for path in draw_run(again.trajectory, again.deadzone, folder, again.title, process=again.process, **look):
+    for path in draw_run(
+        again.trajectory, again.deadzone, folder, again.title, process=again.process, **look
+    ):
         print(path)
     return EXIT_OPTIMAL

@@ -13,6 +13,7 @@ import numpy as np
 from jaxmpc.controller.controller import Batch
 from jaxmpc.errors import InputError
 from jaxmpc.loop.compiled import Inputs
+from jaxmpc.loop.events import Stage, has_lanes, staged
 from jaxmpc.loop.noise import check_deviation, check_seed, errors_of
 from jaxmpc.problem.structure import Structure
 from jaxmpc.process.plant import JaxPlant, disturbances_of
@@ -32,6 +33,7 @@ class Sweep:
     seeds: np.ndarray  # "lane 2": seed and stream
     faults: np.ndarray  # "sample cv" or "lane sample cv"
     position_feedback: np.ndarray  # "lane"
+    stages: list[list[Stage]]  # of every controller; empty without events
     measured: list[int]  # which of the disturbances the controllers are told
     preview: bool
     samples: int
@@ -49,13 +51,14 @@ class Sweep:
         plants,
         reference,
         *,
-        samples,
-        disturbance,
-        noise,
-        seed,
-        faults,
-        position_feedback,
-        preview,
+        samples=None,
+        disturbance=None,
+        noise=None,
+        seed=0,
+        faults=None,
+        position_feedback=False,
+        preview=False,
+        events=(),
     ) -> Sweep:
         """The sweep, or an `InputError` that names what does not fit."""
         plants = plants if isinstance(plants, Lanes) else for_all(plants)
@@ -102,6 +105,7 @@ class Sweep:
             "seed": len(seed) if seed.ndim else None,
             "faults": len(failing) if failing.ndim == 3 else None,
             "position_feedback": len(told) if told.ndim else None,
+            "events": len(events) if has_lanes(events) else None,
         }
         given = {name: count for name, count in counts.items() if count is not None}
         if len(set(given.values())) != 1 or not min(given.values()):
@@ -123,6 +127,9 @@ class Sweep:
         if failing.shape not in shapes:
             expected = " or ".join(str(list(s)) for s in shapes) + " errors, one per sample and CV"
             raise InputError("faults", f"shape {list(failing.shape)}", expected)
+        stages = []
+        if events:
+            controllers, stages = staged(controllers, events, count, len(setpoints[0]))
         stream = np.arange(count) if seed.ndim == 0 else np.zeros(count)
         return cls(
             controllers=controllers,
@@ -133,6 +140,7 @@ class Sweep:
             seeds=np.stack([np.broadcast_to(seed, count), stream], axis=1).astype(np.int64),
             faults=failing,
             position_feedback=np.broadcast_to(told, count),
+            stages=stages,
             measured=[names.index(name) for name in controllers.dv_names],
             preview=bool(preview),
             samples=len(setpoints[0]),
@@ -144,6 +152,12 @@ class Sweep:
         if self.controllers.count == 1:
             return self.controllers.repeated(len(index))
         return self.controllers.part(index)
+
+    def stages_of(self, index: np.ndarray) -> list[list[Stage]]:
+        """What holds from which sample on in some lanes; nothing without events."""
+        if len(self.stages) == 1:
+            return self.stages * len(index)
+        return [self.stages[k] for k in index] if self.stages else []
 
     def inputs_of(self, index: np.ndarray) -> Inputs:
         """What comes from outside, of some lanes."""
