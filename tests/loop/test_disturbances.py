@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from jaxmpc.loop.reference import Reference
 
 from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.errors import InputError
@@ -14,6 +13,7 @@ from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import make_tuning
 from jaxmpc.process.host import HostPlant
 from jaxmpc.process.model_plant import ModelPlant
+from jaxmpc.process.reference import Reference
 
 SAMPLES, DT = 70, 10.0  # more than one call of the longest length
 LEVEL, VALVE = np.array([50.0]), np.array([40.0, 30.0])

@@ -3,7 +3,6 @@
 import jax
 import numpy as np
 import pytest
-from jaxmpc.loop.reference import Reference
 
 from jaxmpc import status
 from jaxmpc.controller.controller import Controller, Controllers
@@ -16,6 +15,7 @@ from jaxmpc.loop.simulate import simulate, simulate_batch
 from jaxmpc.problem.tuning import make_tuning
 from jaxmpc.process.host import HostPlant
 from jaxmpc.process.model_plant import ModelPlant
+from jaxmpc.process.reference import Reference
 from tests.five_controllers import START
 
 SAMPLES, DT = 80, 10.0

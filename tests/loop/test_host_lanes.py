@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from jaxmpc.loop.reference import Reference
 
 from identify.fmu import FmuPlant
 from jaxmpc import status
@@ -20,6 +19,7 @@ from jaxmpc.model.step_response import make_model
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import make_tuning
 from jaxmpc.process.actuator import Actuator
+from jaxmpc.process.reference import Reference
 from tests import fmus
 
 SAMPLES, LANES, TOLD = 30, 5, [True, False, True, False, True]

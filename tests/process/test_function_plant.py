@@ -5,7 +5,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxmpc.loop.reference import Reference
 
 from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.errors import InputError, PlantError
@@ -17,6 +16,7 @@ from jaxmpc.process.actuator import Actuator
 from jaxmpc.process.function_plant import FunctionPlant
 from jaxmpc.process.host import HostPlant
 from jaxmpc.process.plant import Parameter, lanes_of_plants
+from jaxmpc.process.reference import Reference
 
 AREA = Parameter("area", "m2", 2.0, positive=True)
 VALVE = Parameter("valve", "m3/s/m^0.5", 0.1, "conductance of the valve", low=0.0)

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from jaxmpc.loop.reference import Reference
 
 from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.errors import InputError
@@ -16,6 +15,7 @@ from jaxmpc.process.actuator import Actuator
 from jaxmpc.process.host import HostPlant
 from jaxmpc.process.model_plant import ModelPlant
 from jaxmpc.process.plant import lanes_of_plants
+from jaxmpc.process.reference import Reference
 from tests.conftest import second_order
 
 TO = Reference([0.0, 50.0], [[0.0, 0.0], [400.0, 8.0]], 400.0)
