@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -54,10 +55,10 @@ class Sweep:
         samples=None,
         disturbance=None,
         noise=None,
-        seed=0,
+        seed: Any = 0,
         faults=None,
-        position_feedback=False,
-        preview=False,
+        position_feedback: Any = False,
+        preview: Any = False,
         events=(),
     ) -> Sweep:
         """The sweep, or an `InputError` that names what does not fit."""
