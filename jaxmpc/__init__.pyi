@@ -9,6 +9,7 @@ from jaxmpc.controller.measurement import fault_errors as fault_errors
 from jaxmpc.controller.plan import solve_plan as solve_plan
 from jaxmpc.controller.targets import TargetController as TargetController
 from jaxmpc.errors import InputError as InputError
+from jaxmpc.loop.events import Event as Event
 from jaxmpc.loop.simulate import simulate as simulate
 from jaxmpc.loop.simulate import simulate_batch as simulate_batch
 from jaxmpc.loop.simulate import simulate_batches as simulate_batches

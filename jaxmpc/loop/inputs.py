@@ -58,7 +58,7 @@ class Sweep:
         seed: Any = 0,
         faults=None,
         position_feedback: Any = False,
-        preview=False,
+        preview: Any = False,
         events=(),
     ) -> Sweep:
         """The sweep, or an `InputError` that names what does not fit."""
