@@ -6,10 +6,11 @@ Studies, the command line and the app open theirs here.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,12 +76,19 @@ def disturbance_of(process: Process, plant: Any, given: np.ndarray) -> np.ndarra
 
 def parameters_of(process: Process, name: str = "") -> tuple[Parameter, ...]:
     """Parameters of a plant of a process that studies may vary."""
-    plant = open_plant(process, name)
-    try:
+    with closing(open_plant(process, name)) as plant:
         return tuple(getattr(plant, "parameter_table", ()))
+
+
+@contextlib.contextmanager
+def closing(plant: Any) -> Iterator[Any]:
+    """A plant, freed at the end if it holds anything outside Python."""
+    try:
+        yield plant
     finally:
-        if hasattr(plant, "close"):
-            plant.close()
+        close = getattr(plant, "close", None)
+        if close is not None:
+            close()
 
 
 def plant_facts(process: Process, plant: Any) -> dict[str, Any]:

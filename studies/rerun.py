@@ -117,6 +117,8 @@ def rerun(store: Path, number: int) -> Rerun:
         noise=scenario.noise,
         faults=scenario.faults,
         position_feedback=scenario.position_feedback,
+        preview=scenario.preview,
+        events=scenario.events,
         seed=scenario.seed,
     )
     shown = lambda value: f"{value:g}" if isinstance(value, float) else value  # noqa: E731

@@ -17,7 +17,7 @@ from jaxmpc.loop.compiled import Inputs
 from jaxmpc.loop.events import Stage, has_lanes, staged
 from jaxmpc.loop.noise import check_deviation, check_seed, errors_of
 from jaxmpc.problem.structure import Structure
-from jaxmpc.process.plant import JaxPlant, disturbances_of
+from jaxmpc.process.plant import JaxPlant, StatefulPlant, disturbances_of
 from jaxmpc.process.reference import Reference
 from jaxmpc.programs.lanes import Lanes, for_all
 
@@ -27,7 +27,7 @@ class Sweep:
     """All lanes of a sweep on the host, checked."""
 
     controllers: Batch
-    plants: Lanes[JaxPlant]
+    plants: Lanes[JaxPlant] | Sequence[StatefulPlant]
     setpoints: Sequence[np.ndarray]  # one for all, or one per lane
     offsets: np.ndarray  # "sample disturbance" or "lane sample disturbance"
     deviation: np.ndarray  # "lane cv"
@@ -62,11 +62,17 @@ class Sweep:
         events=(),
     ) -> Sweep:
         """The sweep, or an `InputError` that names what does not fit."""
-        plants = plants if isinstance(plants, Lanes) else for_all(plants)
+        if isinstance(plants, (list, tuple)):
+            if not plants:
+                raise InputError("plants", [], "one or more, one per lane")
+            first, own_plants = plants[0], len(plants)
+        else:
+            plants = plants if isinstance(plants, Lanes) else for_all(plants)
+            first, own_plants = plants.shared, plants.count
         structure = controllers.structure
-        if abs(plants.shared.dt - structure.dt) > 1e-9 * structure.dt:
+        if abs(first.dt - structure.dt) > 1e-9 * structure.dt:
             expected = f"the controller's sampling interval {structure.dt} s"
-            raise InputError("plant.dt", plants.shared.dt, expected)
+            raise InputError("plant.dt", first.dt, expected)
         own_references = not isinstance(reference, Reference)
         references = list(reference) if own_references else [reference]
         if samples is None and references:
@@ -77,7 +83,7 @@ class Sweep:
                 raise InputError("reference.setpoints", f"{r.cv_count} columns", expected)
         known = {r: r.sample(structure.dt, samples) for r in dict.fromkeys(references)}
         setpoints = [known[r] for r in references]
-        names, shape = disturbances_of(plants.shared), (samples or 0, structure.cv_count)
+        names, shape = disturbances_of(first), (samples or 0, structure.cv_count)
         for name in controllers.dv_names:
             if name not in names:
                 raise InputError("model.dv", name, f"one of the plant's disturbances, {list(names)}")
@@ -99,7 +105,7 @@ class Sweep:
             "controllers": controllers.count
             if controllers.count > 1 or controllers.scenarios.lanes
             else None,
-            "plants": plants.count,
+            "plants": own_plants,
             "reference": len(references) if own_references else None,
             "disturbance": len(offsets) if offsets.ndim == 3 else None,
             "noise": len(deviation) if deviation.ndim == 2 else None,

@@ -19,6 +19,7 @@ from jaxmpc.errors import InputError
 from jaxmpc.loop.compiled import Inputs, simulate_compiled
 from jaxmpc.loop.events import Event
 from jaxmpc.loop.host import simulate_on_host
+from jaxmpc.loop.host_lanes import simulate_host_lanes
 from jaxmpc.loop.inputs import Sweep
 from jaxmpc.loop.interventions import checked_sample
 from jaxmpc.loop.trajectory import RECORDABLE, Trajectory, TrajectoryBatch
@@ -146,7 +147,7 @@ def simulate_batch(*arguments: Any, **options: Any) -> list[Trajectory]:
 
 def simulate_batches(
     controllers: Controllers | Controller,
-    plants: Lanes[JaxPlant] | JaxPlant,
+    plants: Lanes[JaxPlant] | JaxPlant | Sequence[StatefulPlant],
     reference: Reference | Sequence[Reference],
     *,
     samples: int | None = None,
@@ -162,7 +163,7 @@ def simulate_batches(
     devices: Sequence[Any] | None = None,
     progress: Progress | None = None,
 ) -> Iterator[TrajectoryBatch]:
-    """Closed loops on plants in JAX, `lanes_at_once` side by side in one compiled program, piece by piece.
+    """Closed loops on plants in JAX, `lanes_at_once` side by side in one compiled program, piece by piece; or on the host.
 
     What is given once is shared by all lanes; anything may have one value per lane instead. A piece is complete in
     time; when the next one is asked for, nothing of it is kept here, so that memory does not grow with the sweep.
@@ -170,7 +171,8 @@ def simulate_batches(
 
     Args:
         controllers: one for all, or one per lane.
-        plants: one, or `Lanes` of them (`lanes.per_lane`).
+        plants: one, or `Lanes` of them (`lanes.per_lane`); or a list of plants that keep their own state, one per lane,
+            which are closed at the end. One that fails ends its own lane (`loop.host_lanes`).
         reference: setpoints for all, or a list with one reference per lane.
         samples: length of the runs; the whole (shortest) reference if not given.
         disturbance: ``"sample disturbance"`` or ``"lane sample disturbance"``, as in `simulate`.
@@ -234,15 +236,25 @@ def _pieces(sweep: Sweep, record, lanes_at_once: int, devices, progress) -> Iter
         yield TrajectoryBatch(  # no name keeps it: it is gone when the caller lets go
             lanes=index[:real],
             setpoint=sweep.setpoints_of(index[:real]),
-            fields=simulate_compiled(
-                sweep.controllers_of(index),
-                sweep.plants.take(index),
-                sweep.inputs_of(index),
-                record,
-                stages=sweep.stages_of(index),
-                real=real,
-                devices=devices,
-                progress=report,
-            ),
+            fields=_fields(sweep, index, real, record, devices, report),
             **_labels(sweep.structure, sweep.samples),
         )
+
+
+def _fields(sweep: Sweep, index: np.ndarray, real: int, record, devices, report) -> dict[str, np.ndarray]:
+    """Recorded fields of some lanes, of which the first `real` count."""
+    if not isinstance(sweep.plants, Lanes):
+        index = index[:real]
+        own, plants = sweep.controllers_of(index), [sweep.plants[k] for k in index]
+        fields, _ = simulate_host_lanes(own, plants, sweep.inputs_of(index), report, sweep.stages_of(index))
+        return {name: fields[name] for name in record}
+    return simulate_compiled(
+        sweep.controllers_of(index),
+        sweep.plants.take(index),
+        sweep.inputs_of(index),
+        record,
+        stages=sweep.stages_of(index),
+        real=real,
+        devices=devices,
+        progress=report,
+    )

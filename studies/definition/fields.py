@@ -244,6 +244,18 @@ def _run_fields(process: Process) -> list[Field]:
         Field(f"noise.{cv.name}", f"noise of the {cv.label}", cv.unit, default=0.0, low=0)
         for cv in process.cvs
     ]
+    out += [
+        Field(
+            f"setpoint_rate.{cv.name}",
+            f"largest rate of change of the setpoint of the {cv.label}",
+            f"{cv.unit}/s",
+            default=math.inf,
+            low=0,
+            infinite=True,
+            shape=True,
+        )
+        for cv in process.cvs
+    ]
     units = {disturbance.unit for disturbance in process.disturbances}
     out += [
         Field("seed", "seed of the noise", "1", "whole", 0, low=0, high=2**32 - 1),
@@ -251,6 +263,8 @@ def _run_fields(process: Process) -> list[Field]:
         Field("sensor_fault.duration", "duration of the sensor fault", "s", low=0),
         Field("sensor_fault.size", "size of the spike", "CV unit"),
         Field("position_feedback", "predictions from the positions of the actuators", "", "flag", False),
+        Field("preview", "future setpoints and measured disturbances are told", "", "flag", False),
+        Field("setpoint_filter", "time constant of the setpoint filter", "s", default=0.0, low=0, shape=True),
     ]
     if process.disturbances:
         unit = units.pop() if len(units) == 1 else "unit of the disturbance"

@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
-from identify.plants import disturbance_of
+from identify.plants import closing, disturbance_of
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.schedule import ModelSchedule, ScheduledController
 from jaxmpc.errors import InputError
@@ -192,17 +192,6 @@ def progress_bar(label: str, show: bool) -> Iterator[Callable[[int, int], None]]
             bar.update(done - bar.n)
 
         yield report
-
-
-@contextlib.contextmanager
-def closing(plant: Any) -> Iterator[Any]:
-    """A plant, freed at the end if it holds anything outside Python."""
-    try:
-        yield plant
-    finally:
-        close = getattr(plant, "close", None)
-        if close is not None:
-            close()
 
 
 def results_layout(
