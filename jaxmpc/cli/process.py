@@ -99,6 +99,36 @@ def check(options: Options) -> int:
     return EXIT_OPTIMAL
 
 
+@command(
+    "process keys",
+    option("process", "PROCESS", "a process file, or the name of a shipped process", str),
+    option("--plant", "NAME", "which plant of the process (default: the first)", ""),
+    epilog=EXITS,
+)
+def keys(options: Options) -> int:
+    """List every key that studies of a process may set and vary, with unit, default and meaning."""
+    from identify.plants import parameters_of
+    from jaxmpc.process.file import load_process
+    from studies.definition.fields import as_text, study_fields
+
+    process = load_process(options.process)
+    tuning = process.tuning(process.structure())
+    at = {name: i for names in (process.cv_names, process.mv_names) for i, name in enumerate(names)}
+    rows = [("key", "unit", "default", "meaning")]
+    for key, field in study_fields(process, parameters_of(process, options.plant)).items():
+        given = field.default
+        if given is None and key.startswith("tuning."):
+            name, _, channel = key.removeprefix("tuning.").partition(".")
+            given = getattr(tuning, name)
+            given = float(given[at[channel]] if channel else given)
+        given = "" if given is None else given
+        rows.append((key, field.unit, given if isinstance(given, str) else as_text(given), field.label))
+    wide = [max(len(str(row[i])) for row in rows) for i in range(3)]
+    for row in rows:
+        print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, (*wide, 0), strict=True)).rstrip())
+    return EXIT_OPTIMAL
+
+
 @command("process list")
 def shipped(options: Options) -> int:
     """List the processes that come with the package."""

@@ -24,6 +24,7 @@ from jaxmpc.process.actuator import Actuator
 from jaxmpc.process.process import Cv, KeyFigure, ModelSource, Mv, PlantSource, Process, Variable
 from jaxmpc.process.reference import Reference
 
+DEFAULT_PROCESS = "gas-lifted-well"  # of studies that name none
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Numbers = dict[str, float]

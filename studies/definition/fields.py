@@ -132,11 +132,13 @@ class Field:
 
 
 def as_text(value: Any) -> str:
-    """A flag, text or list of lengths or values as it stands in a coordinate and in a CSV file."""
+    """A number, flag, text or list of lengths or values as it stands in a coordinate and in a CSV file."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
         return value
+    if isinstance(value, (int, float)):
+        return f"{value:.10g}"
     return (
         "; ".join(map(as_text, value))
         if isinstance(value[0], (list, tuple))

@@ -212,7 +212,6 @@ def test_an_output_that_cannot_be_written_is_refused_before_the_solve(write, tmp
         ["fmu", "build", "--fmi", "1"],
         ["identify", "--samples", "many"],
         ["study", "run"],
-        ["study", "run", "thesis", "--plant", "septic"],
         ["bench", "relaxed"],
     ],
 )
@@ -232,7 +231,7 @@ def test_unknown_commands_and_options_are_bad_input(arguments, unsolved, capsys)
         (["plan"], ["--out", "standard output", "--finish", "default: auto", "3 infeasible"]),
         (["fmu", "build"], ["--fmi", "default: 2"]),
         (["identify"], ["[%]", "[m3/h]", "default: 7500.0", "default: 250", "10 s"]),
-        (["study", "run", "thesis"], ["default: results", "--quick", "default: fmu"]),
+        (["study", "run", "thesis"], ["default: results", "--quick", "default: that of the study"]),
         (["bench"], ["--quick", "default: all", "default: nowhere", "[ms]", "jaxmpc[bench]", "Ctrl-C"]),
     ],
 )
@@ -315,10 +314,11 @@ def test_the_thesis_study_gets_its_options_and_bad_ones_are_reported(stub, tmp_p
     given = []
     stub(
         "studies.thesis.catalogue",
-        run_named=lambda *options: given.append(options) or tmp_path / "r" / "thesis",
+        STUDIES=("thesis",),
+        run_thesis=lambda *options: given.append(options) or tmp_path / "r" / "thesis",
     )
     stub("figures.registry", draw_study=lambda *options: given.append(options))
-    stub("studies.thesis.report", write_summary=lambda *options: given.append(options))
+    stub("studies.thesis.report", write_thesis_summary=lambda *options: given.append(options))
     assert main(["study", "run", "thesis", "--out", str(tmp_path / "r"), "--quick", "--plant", "jax"]) == 0
     assert given == [("thesis", tmp_path / "r", True, "jax"), *2 * [(tmp_path / "r" / "thesis", "thesis")]]
     assert str(tmp_path / "r" / "thesis" / "summary.md") in capsys.readouterr().out
@@ -326,17 +326,24 @@ def test_the_thesis_study_gets_its_options_and_bad_ones_are_reported(stub, tmp_p
     def refuse(*_):
         raise InputError("reference.duration", 10, "at least 20 s")
 
-    stub("studies.thesis.catalogue", run_named=refuse)
+    stub("studies.thesis.catalogue", STUDIES=("thesis",), run_thesis=refuse)
     assert main(["study", "run", "thesis", "--out", str(tmp_path / "r")]) == 2
     assert "reference.duration" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_every_study_of_the_catalogue_can_be_named_on_the_command_line():
-    from jaxmpc.cli.study import COMPARISONS
+def test_a_plant_that_a_comparison_does_not_have_is_bad_input(tmp_path, capsys):
+    assert main(["study", "run", "thesis", "--plant", "septic", "--out", str(tmp_path / "r")]) == 2
+    assert "one of fmu, jax" in capsys.readouterr().err
+    assert not (tmp_path / "r").exists()
+
+
+def test_every_comparison_can_be_named_on_the_command_line():
+    from studies.definition.catalogue import is_comparison
     from studies.thesis.catalogue import STUDIES
 
-    assert set(STUDIES) <= set(COMPARISONS)
+    assert all(map(is_comparison, (*STUDIES, "comparison")))
+    assert not is_comparison("deadzone")
 
 
 def test_figures_are_listed_without_an_id_and_produced_with_one(stub, tmp_path, capsys):
