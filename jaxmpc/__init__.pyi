@@ -20,9 +20,11 @@ from jaxmpc.problem.structure import Structure as Structure
 from jaxmpc.problem.tuning import make_tuning as make_tuning
 from jaxmpc.problem.tuning import stack_tunings as stack_tunings
 from jaxmpc.process.actuator import Actuator as Actuator
+from jaxmpc.process.file import load_process as load_process
 from jaxmpc.process.function_plant import FunctionPlant as FunctionPlant
 from jaxmpc.process.model_plant import ModelPlant as ModelPlant
 from jaxmpc.process.plant import Parameter as Parameter
+from jaxmpc.process.process import Process as Process
 from jaxmpc.process.reference import Reference as Reference
 from jaxmpc.process.well.plant import WellPlant as WellPlant
 from jaxmpc.steady.map import SteadyMap as SteadyMap
