@@ -188,19 +188,36 @@ def model_of(
     """
     if process.model.file:
         return load_model(process)
-    at = [float(v) for v in working_point] or process.model.working_point or None
-    steps = process.model.steps or None
-    own = plant is None
-    plant = open_plant(process, actual=False) if own else plant
-    try:
-        return identify_step_response(
-            plant,
-            at,
-            steps,
-            samples or process.model.samples,
-            disturbance_steps=process.model.disturbance_steps,
-            signals=signals_in(process),
-        )
-    finally:
-        if own and hasattr(plant, "close"):
-            plant.close()
+    point = dict(zip(process.mv_names, map(float, working_point), strict=True)) if working_point else {}
+    if plant is not None:
+        return identified(process, plant, point, samples=samples)
+    with closing(open_plant(process, actual=False)) as own:
+        return identified(process, own, point, samples=samples)
+
+
+def identified(
+    process: Process,
+    plant: Any,
+    point: Mapping[str, float] | None = None,
+    steps: Mapping[str, float] | None = None,
+    samples: int | None = None,
+) -> StepResponseModel:
+    """A model from a step test on a plant of a process, whatever its file says of a model.
+
+    Args:
+        point, steps: by MV, where they are not those of the process [MV unit].
+        samples: coefficients; those of the process if not given.
+
+    Raises:
+        InputError: for a working point from which the steps cannot be made.
+    """
+    at = process.model.working_point | dict(point or {})
+    sizes = process.model.steps | dict(steps or {})
+    return identify_step_response(
+        plant,
+        at or None,
+        sizes or None,
+        samples or process.model.samples,
+        disturbance_steps=process.model.disturbance_steps,
+        signals=signals_in(process),
+    )

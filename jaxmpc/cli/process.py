@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, command, option
+from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, command, named_number, option
 from jaxmpc.errors import InputError
 from jaxmpc.files import check_folder, check_target
 
@@ -32,7 +32,11 @@ def new(options: Options) -> int:
     name = _named(out.stem)
     file = _relative(options.model, out.parent)
     text, guesses = new_process(
-        model, file, name, steps=dict(map(_sized, options.step or ())), switches=options.on_off or ()
+        model,
+        file,
+        name,
+        steps=dict(named_number("--step", text) for text in options.step or ()),
+        switches=options.on_off or (),
     )
     write_atomically(out, text)
     load_process(out)
@@ -54,14 +58,6 @@ def _relative(file: Path, folder: Path) -> str:
         return file.resolve().relative_to(folder.resolve()).as_posix()
     except ValueError:
         return str(file.resolve())
-
-
-def _sized(text: str) -> tuple[str, float]:
-    name, _, size = text.partition("=")
-    try:
-        return name, float(size)
-    except ValueError:
-        raise InputError("--step", text, "MV=SIZE, such as valve=2") from None
 
 
 @command(

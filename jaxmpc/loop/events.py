@@ -27,7 +27,7 @@ class Event:
 
     Attributes:
         time: the first sample at or after it is the first that is decided with the changes [s].
-        tuning: new values by field of `Tuning`. Those of a mapping by name, such as ``{"deadzone": {"oil": 2.0}}``, leave
+        tuning: new values by field of `Tuning`. Those of a mapping by name, such as ``{"deadzone": {"level": 2.0}}``, leave
             the other CVs or MVs as they are; a vector or a number is for all of them. None takes a limit away.
         cv_off: names of CVs that have neither weights nor limits from now on.
         cv_on: names of CVs that get back what the tuning says.

@@ -305,7 +305,7 @@ def test_identify_writes_a_model_that_says_where_it_comes_from(tmp_path, capsys)
 
 def test_identify_refuses_a_working_point_outside_the_well(tmp_path, capsys):
     out = tmp_path / "model.json"
-    assert main(["identify", "--plant", "jax", "--choke", "101", "--out", str(out)]) == 2
+    assert main(["identify", "--plant", "jax", "--at", "choke=101", "--out", str(out)]) == 2
     assert "choke" in capsys.readouterr().err
     assert not out.exists()
 
