@@ -1,211 +1,268 @@
-"""Figures of the interactive app: one run beside a pinned one, the plan made at any time, the scenarios of a store.
+"""Charts of the interactive app to zoom into: runs side by side on one time axis, and the plan made at any time.
 
-Runs come as results of one controller (`studies.notebooks.loop.ExploreRun.data`, or `stored` for a scenario of a store). The
-layout is fixed instead of computed, so that a figure is there a fraction of a second after its run.
+Runs come as results of one controller (`studies.notebooks.loop.ExploreRun.data`, or `figures.choose.stored` for a scenario
+of a store). A chart is a description in Vega-Lite that the browser draws, written as it is: it is there a moment after its
+run, and a page that is sent carries what draws it.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
+import dataclasses
+import importlib.util
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-import matplotlib
 import numpy as np
 import pandas as pd
 import xarray as xr
-from matplotlib.figure import Figure
 
-from figures import closed_loop, panels, style
+from figures import panels, style
 from figures.closed_loop import RUN
-from figures.planned import BEFORE, draw_plan
-from figures.sweep.data import (
-    SETTLED,
-    controller_of,
-    deviation,
-    figure_of,
-    load,
-    setting,
-    shown_mv,
-    sweep_axes,
-    travel_title,
-)
-from figures.sweep.wear import front
-from jaxmpc.errors import InputError
-from studies.kpi.evaluate import completed, key_figures
+from jaxmpc.errors import MissingToolError
+from jaxmpc.process.process import Process
 from studies.plans import plan_at
-from studies.store.files import RESULTS
 from studies.store.process import process_in
-from studies.store.reading import open_results
 
-X, Y = "travel", "deviation"  # columns of `points`, [MV unit] and [1]
+COLOURS = [style.BLUE, style.VERMILLION, style.GREEN, style.ORANGE, style.PURPLE, style.SKY]
+COLOURS += ["#8C6D31", "#7F7F7F", "#A6761D", "#393B79"]
+ZOOM = "zoom"  # name of the selection of the time axis
+BEFORE = 60  # samples of the past beside a plan
+CAPTION = "Setpoint dashed, deadzone grey, demands of stepped MVs dotted. Drag over the strip at the bottom to zoom."
+LEFT = 52  # pixels for the numbers of a vertical axis: panels below each other line up
+FONT = "system-ui, sans-serif"
+PLAN = {  # colour and dashes of what is beside a plan
+    "setpoint": ("black", [5, 3]),
+    "later": ("#9DC3E6", [1, 0]),
+    "actual": (style.BLUE, [1, 0]),
+    "plan": (style.PLAN, [1, 0]),
+}
+
+Spec = dict[str, Any]  # of Vega-Lite
 
 
-@style.house_style
+@dataclasses.dataclass(frozen=True, eq=False)
+class Shown:
+    """A run among others in one chart."""
+
+    name: str
+    colour: str
+    data: xr.Dataset  # of one controller `RUN`
+
+
 def tracking(
-    data: xr.Dataset, controller: str = RUN, pinned: xr.Dataset | None = None, wide: bool = False
-) -> Figure:
-    """CVs with setpoint and deadzone above, MVs below, as `closed_loop.tracking`; `wide` for the width of the page."""
-    used = data.sizes["cv"], data.sizes["mv"]
-    drawn, axes = _panels(2, max(used), 9.6 if wide else 6.9, 4.2 if wide else 4.5)
-    shown = [ax for row, count in zip(axes, used, strict=True) for ax in row[:count]]
-    closed_loop.tracking(shown, data, controller, pinned, legend=False, bins=7)
-    for ax in axes.flat:
-        ax.set_visible(ax in shown)
-    panels.shared_legend(drawn, axes.flat, "upper center", borderaxespad=0.2)
-    return drawn
-
-
-@style.house_style
-def planned(data: xr.Dataset, time: float, controller: str = RUN) -> Figure:
-    """The plan made at a time [s]: CVs, MVs and their moves; what came of it pale."""
-    plan = plan_at(data, controller, time)
-    used = data.sizes["cv"], data.sizes["mv"], data.sizes["mv"]
-    drawn, axes = _panels(3, max(used), 9.6, 5.2)
-    for row, count in zip(axes, used, strict=True):
-        for ax in row[count:]:
-            ax.set_visible(False)
-    shown = max(plan.time - BEFORE * plan.dt, 0.0), float(plan.cv_time[-1])
-    draw_plan(axes, data, controller, plan, shown, known=plan.time, pale=True)
-    panels.shared_legend(drawn, axes.flat, "upper center", borderaxespad=0.2)
-    return drawn
-
-
-def points(store: str | Path) -> pd.DataFrame:
-    """The runs of a study store, a row each, for `scatter`.
+    runs: Sequence[Shown], zoom: Sequence[float] | None = None, width: int = 560, height: int = 96
+) -> Spec:
+    """Runs on one time axis: a panel for each CV and MV, and below them a strip of it to drag over, which zooms all.
 
     Args:
-        store: of a sweep (ending in ``.zarr``) or of a comparison (its folder or ``results.zarr``).
-
-    Returns:
-        A table with ``number`` (of the scenario; position of the controller in a comparison), ``run`` in words, `X` of
-        `figures.sweep.data.shown_mv`, `Y` [1], ``group`` for the colours, ``best`` for runs that no other beats in both, and
-        a text column for each thing that varies. Attribute ``group`` says what the groups are, ``titles`` what `X` and `Y`.
-
-    Raises:
-        InputError: if there is no store, or nothing of it is finished.
+        runs: setpoint and deadzone are those of the first, which lies on top.
+        zoom: start and end that are shown, in the unit of the time axis; everything if not given.
+        width: of a panel [pixels].
+        height: likewise.
     """
-    if is_comparison(store):
-        data = completed(open_results(store))
-        figures = key_figures(data).load()
-        texts = {}
-        title, numbers, names = "controller", np.arange(data.sizes["controller"]), data.label.values.tolist()
-        groups = names
-    else:
-        data = figures = load(store)
-        axes = sweep_axes(data)
-        texts = {_plain(axis.label): [axis.text(v) for v in axis.values.tolist()] for axis in axes}
-        title, numbers = _plain(axes[0].title) if axes else "", data.scenario.values
-        rows = zip(*texts.values(), strict=True) if texts else [()] * len(numbers)
-        names = [", ".join(map(" ".join, zip(texts, row, strict=True))) for row in rows]
-        groups = next(iter(texts.values()), ["all"] * len(names))
-    travel, away = (
-        values.values.astype(float) for values in (figure_of(figures, "travel"), deviation(figures))
+    first = runs[0].data
+    process = process_in(first)
+    seconds, unit = panels.time_unit(*panels.span(first))
+    table = pd.concat([_rows(run, process, seconds) for run in reversed(runs)])
+    legend = (
+        {"orient": "top", "title": None, "symbolType": "stroke", "labelLimit": 300} if len(runs) > 1 else None
     )
-    best = np.where(front(travel, away), "on the front", "beaten")
-    out = pd.DataFrame(
-        {"number": numbers, "run": names, X: travel, Y: away, "group": groups, **texts, "best": best}
-    )
-    out.attrs["group"] = title
-    out.attrs["titles"] = {X: travel_title(shown_mv(process_in(data))), Y: f"mean deviation / {SETTLED} [1]"}
-    return out
-
-
-def is_comparison(store: str | Path) -> bool:
-    """Whether a store is that of a comparison of controllers rather than of a sweep."""
-    path = Path(store)
-    return path.name == RESULTS or (path / RESULTS).is_dir()
-
-
-def stored(store: str | Path, number: int) -> xr.Dataset:
-    """The stored run of a row of `points`, as `tracking` reads it: one controller `RUN`.
-
-    Raises:
-        InputError: for a store without trajectories, or a number that is not in it.
-    """
-    if is_comparison(store):
-        data = completed(open_results(store))
-        if not 0 <= number < data.sizes["controller"]:
-            raise InputError("number", number, f"0 to {data.sizes['controller'] - 1}")
-        return data.isel(controller=[number]).assign_coords(controller=[RUN]).load()
-    whole = load(store)
-    if number not in whole.scenario.values:
-        raise InputError("number", number, "a finished scenario of the store")
-    stored_as = ["measurement", "position", "setpoint"]
-    missing = [name for name in stored_as if name not in whole]
-    if missing:
-        expected = "stored cv, mv and setpoint"
-        raise InputError("store.trajectories", missing, expected, "Run the scenario again")
-    kinds, actuators = controller_of(whole)
-    place = int(np.flatnonzero(whole.scenario.values == number)[0])
-    one = whole[stored_as].sel(scenario=number).load()
-    one = one.drop_vars([str(name) for name, coord in one.coords.items() if coord.ndim == 0])
-    last = np.flatnonzero(np.isfinite(one.measurement.values).all(axis=1))
-    one = one.isel(time=slice(0, int(last[-1]) + 1 if last.size else 0))
-    dt = float(np.diff(one.time.values[:2])[0]) if one.sizes["time"] > 1 else 1.0
-    zones = [_deadzone(whole, place, str(cv)) for cv in one.cv.values]
-    return closed_loop.results(one, dt, zones, str(kinds[place]), str(actuators[place]), process_in(whole))
-
-
-def scatter(table: pd.DataFrame) -> Any:
-    """The runs of `points` as an Altair chart to pick from; those on the front have a black ring."""
-    import altair as alt
-
-    varying = [str(name) for name in table.columns if name not in ("best", "group", "number", X, Y)]
-    many = len(set(table["group"])) > len(_COLOURS)
-    legend = alt.Legend(title=table.attrs.get("group"), titleLimit=400, orient="top")
-    scale, titles = alt.Scale(range=_COLOURS), table.attrs.get("titles", {X: X, Y: Y})
-    colour = alt.value(style.BLUE) if many else alt.Color("group:N", scale=scale, sort=None, legend=legend)
-    return (
-        alt.Chart(table)
-        .mark_point(filled=True, size=90, strokeWidth=1.6, opacity=0.9)
-        .encode(
-            x=alt.X(f"{X}:Q", title=titles[X], scale=alt.Scale(zero=False)),
-            y=alt.Y(f"{Y}:Q", title=titles[Y], scale=alt.Scale(zero=False)),
-            color=colour,
-            stroke=alt.condition("datum.best == 'on the front'", alt.value("black"), alt.value("white")),
-            tooltip=[*varying, *(alt.Tooltip(f"{k}:Q", title=titles[k], format=",.4g") for k in (X, Y))],
+    scale = {"domain": [run.name for run in runs], "range": [run.colour for run in runs]}
+    colour = {"field": "run", "type": "nominal", "scale": scale, "sort": scale["domain"], "legend": legend}
+    of_run = {"color": colour, "detail": {"field": "run"}}
+    top = [{"filter": {"field": "run", "equal": runs[0].name}}]
+    out = []
+    for variable, letter, i in [
+        *((cv, "c", i) for i, cv in enumerate(process.cvs)),
+        *((mv, "m", i) for i, mv in enumerate(process.mvs)),
+    ]:
+        last = variable is process.mvs[-1]
+        x = _time(unit if last else None, labels=last, domain={"param": ZOOM})
+        line = _mark("linear" if letter == "c" else "step-after", strokeWidth=1.6)
+        layers = [{"mark": line, "encoding": of_run | {"x": x, "y": _value(f"{letter}{i}")}}]
+        if letter == "c":
+            band = _mark("step-after", type="area", opacity=0.18, color=style.GREY)
+            held = _mark("step-after", strokeWidth=1.1, strokeDash=[5, 3], color="black")
+            within = {"x": x, "y": _value(f"l{i}"), "y2": {"field": f"h{i}"}}
+            layers.insert(0, {"transform": top, "mark": held, "encoding": {"x": x, "y": _value(f"s{i}")}})
+            layers.insert(0, {"transform": top, "mark": band, "encoding": within})
+        elif f"d{i}" in table:
+            asked = _mark("step-after", strokeWidth=1.1, strokeDash=[2, 2])
+            layers.insert(0, {"mark": asked, "encoding": of_run | {"x": x, "y": _value(f"d{i}")}})
+        inside = [{"filter": {"param": ZOOM}}]
+        out.append(
+            _panel(style.label(variable.label, variable.unit), layers, width, height) | {"transform": inside}
         )
-        .properties(width="container", height=300, usermeta={"embedOptions": {"renderer": "svg"}})
+    chosen = {} if zoom is None else {"value": {"x": list(zoom)}}
+    strip = {
+        "width": width,
+        "height": 30,
+        "params": [{"name": ZOOM, "select": {"type": "interval", "encodings": ["x"]}, **chosen}],
+        "mark": _mark("linear", strokeWidth=0.8),
+        "encoding": of_run
+        | {
+            "x": _time(None, axis={"grid": False, "tickCount": 8}),
+            "y": _value("c0") | {"axis": {"labels": False, "ticks": False, "minExtent": LEFT}},
+        },
+    }
+    return _chart([*out, strip]) | {"data": inline(table)}
+
+
+def planned(data: xr.Dataset, time: float, width: int = 375, height: int = 110) -> Spec:
+    """The plan made at a time [s]: CVs, MVs and their moves, a panel each; what came of it pale.
+
+    Raises:
+        InputError: for a time at which no plan was made.
+    """
+    process, plan = process_in(data), plan_at(data, RUN, time)
+    run, times = data.sel(controller=RUN), data.time.values
+    begin, end = max(plan.time - BEFORE * plan.dt, 0.0), float(plan.cv_time[-1])
+    seconds, unit = panels.time_unit(begin, end)
+    inside = (times >= begin) & (times <= end)
+    past, later = inside & (times <= plan.time), inside & (times >= plan.time)
+    made = inside & (times < plan.time)  # the moves of the time itself are not made yet
+    names = list(PLAN)
+    legend = {"orient": "top", "title": None, "symbolType": "stroke"}
+    colours, dashes = ({"domain": names, "range": [look[k] for look in PLAN.values()]} for k in (0, 1))
+    looks = {
+        "color": {"field": "what", "type": "nominal", "sort": None, "scale": colours, "legend": legend},
+        "strokeDash": {"field": "what", "type": "nominal", "scale": dashes, "legend": None},
+        "detail": {"field": "what"},
+    }
+    rule = {"type": "rule", "color": style.GREY, "strokeDash": [3, 3]}
+
+    def panel(title: str, parts: dict[str, tuple[Any, Any]], interpolate: str, last: bool) -> Spec:
+        table = pd.concat(
+            [pd.DataFrame({"t": t / seconds, "y": y, "what": w}) for w, (t, y) in parts.items()]
+        )
+        x = _time(unit if last else None, labels=last, domain=[begin / seconds, end / seconds])
+        now = {"data": {"values": [{"t": plan.time / seconds}]}, "mark": rule, "encoding": {"x": x}}
+        lines = {"mark": _mark(interpolate, strokeWidth=1.5), "encoding": looks | {"x": x, "y": _value("y")}}
+        return _panel(title, [now, lines], width, height) | {"data": inline(table)}
+
+    rows: list[list[Spec]] = [[], [], []]
+    for i, cv in enumerate(process.cvs):
+        values, held = run.measurement.values[:, i], data.setpoint.values[inside, i]
+        parts = {
+            "setpoint": (np.repeat(times[inside], 2)[1:], np.repeat(held, 2)[:-1]),
+            "later": (times[later], values[later]),
+            "actual": (times[past], values[past]),
+            "plan": (plan.cv_time, plan.cv[:, i]),
+        }
+        rows[0].append(panel(style.label(cv.label, cv.unit), parts, "linear", False))
+    ahead = np.append(plan.move_time, [plan.move_time[-1] + plan.dt, end])
+    for i, mv in enumerate(process.mvs):
+        kinds = (("position", "", plan.mv, plan.mv[-1, i]), ("move", ", move", plan.move, 0.0))
+        for row, (name, words, values, after) in enumerate(kinds, start=1):
+            done = run[name].values[:, i]
+            parts = {
+                "later": (times[later], done[later]),
+                "actual": (times[made], done[made]),
+                "plan": (ahead, np.append(values[:, i], [after, after])),
+            }
+            rows[row].append(panel(style.label(mv.label + words, mv.unit), parts, "step-after", row == 2))
+    return _chart([{"hconcat": row, "spacing": 16} for row in rows])
+
+
+def as_html(spec: Spec) -> str:
+    """A chart as part of a page that needs nothing else: what draws it is in it.
+
+    Raises:
+        MissingToolError: if vl-convert is not installed, which brings the script.
+    """
+    if importlib.util.find_spec("vl_convert") is None:
+        raise MissingToolError("A page to send needs vl-convert: pip install 'jaxmpc[notebook]'")
+    import altair
+
+    return altair.VConcatChart.from_dict(spec, validate=False).to_html(
+        inline=True, fullhtml=False, output_div="chart"
     )
 
 
-_COLOURS = [style.BLUE, style.VERMILLION, style.GREEN, style.ORANGE, style.PURPLE, style.SKY]
-_COLOURS += ["#8C6D31", "#7F7F7F", "#A6761D", "#393B79"]
+def altair_of(spec: Spec) -> Any:
+    """A chart for ``marimo.ui.altair_chart``; Altair's own objects for one take longer than a run."""
+    import altair
+
+    class Described(altair.TopLevelMixin):
+        data, params = altair.Undefined, ()
+
+        def copy(self, *_: Any, **__: Any) -> Any:
+            return self
+
+        def to_dict(self, *_: Any, **__: Any) -> Any:
+            return spec
+
+    return Described()
 
 
-png = style.png
+def inline(table: pd.DataFrame) -> Spec:
+    """A table as text within a chart; all but names are numbers."""
+    names = [name for name in table.columns if name not in ("run", "what")]
+    text = table.to_csv(index=False, float_format="%.7g")
+    return {"values": text, "format": {"type": "csv", "parse": dict.fromkeys(names, "number")}}
 
 
-def image(figure: Figure, name: str) -> str:
-    """A figure as HTML that needs no further file; `name` says what it shows, for screen readers."""
-    return style.image(png(figure), name, ' style="width:100%"')
+def _rows(run: Shown, process: Process, seconds: float) -> pd.DataFrame:
+    """A row per sample and for the end of the last: ``t``, per CV c, s (setpoint), l and h (deadzone), per MV m and d."""
+    data = run.data.sel(controller=RUN)
+    times = np.append(data.time.values, panels.span(run.data)[1]) / seconds
+    table: dict[str, Any] = {"run": run.name, "t": times}
+    half = np.asarray(data.tuning_deadzone.values, dtype=float)
+    last = lambda values: np.append(values, values[-1])  # noqa: E731
+    for i in range(len(process.cvs)):
+        held = last(data.setpoint.values[:, i])
+        table[f"c{i}"] = last(data.measurement.values[:, i])
+        table |= {f"s{i}": held, f"l{i}": held - half[i], f"h{i}": held + half[i]}
+    for i in range(len(process.mvs)):
+        table[f"m{i}"] = last(data.position.values[:, i])
+        if "demand" in data and i in process.stepped:
+            table[f"d{i}"] = last(data.demand.values[:, i])
+    return pd.DataFrame(table)
 
 
-def _panels(rows: int, columns: int, width: float, height: float) -> tuple[Figure, np.ndarray]:
-    """A figure with a fixed layout; axes ``"row column"``."""
-    with matplotlib.rc_context({"figure.constrained_layout.use": False}):
-        drawn, axes = style.grid(rows, columns, width, height)
-    drawn.subplots_adjust(
-        left=0.78 / width,
-        right=1 - 0.12 / width,
-        bottom=0.5 / height,
-        top=1 - 0.34 / height,
-        wspace=0.3 if width < 8 else 0.2,
-        hspace=0.12,
-    )
-    for ax in axes[:-1].flat:
-        ax.tick_params(labelbottom=False)
-    return drawn, axes
+def _mark(interpolate: str, **look: Any) -> Spec:
+    return {"type": "line", "clip": True, "interpolate": interpolate} | look
 
 
-def _deadzone(data: xr.Dataset, place: int, cv: str) -> float:
-    """Half width of the deadzone of a scenario; 0 without Soft MPC."""
-    one = data.isel(scenario=[place])  # an axis of one value is a setting
-    soft = sum(float(setting(one, f"tuning.{key}.{cv}")) for key in ("soft_quadratic", "soft_linear"))
-    hard = setting(one, "soft") in (False, "false") or soft == 0
-    return 0.0 if hard else float(setting(one, f"tuning.deadzone.{cv}"))
+def _time(unit: str | None, *, labels: bool = True, domain: Any = None, axis: Spec | None = None) -> Spec:
+    """The time axis of a panel; it is labelled if `unit` is given."""
+    title = None if unit is None else f"time [{unit}]"
+    scale = {"nice": False} | ({} if domain is None else {"domain": domain})
+    return {
+        "field": "t",
+        "type": "quantitative",
+        "title": title,
+        "scale": scale,
+        "axis": axis or {"labels": labels},
+    }
 
 
-def _plain(name: str) -> str:
-    """A column name without what the chart language reads as structure."""
-    return name.replace(".", " ").replace("[", "(").replace("]", ")").replace(":", " ")
+def _value(name: str) -> Spec:
+    axis = {"minExtent": LEFT, "tickCount": 4}
+    return {"field": name, "type": "quantitative", "title": None, "scale": {"zero": False}, "axis": axis}
+
+
+def _panel(title: str, layers: list[Spec], width: int, height: int) -> Spec:
+    heading = {"text": title, "anchor": "start", "offset": 3}
+    return {"title": heading, "width": width, "height": height, "layer": layers}
+
+
+def _chart(rows: Iterable[Spec]) -> Spec:
+    """Rows below each other, with the fonts and lines of every chart of the app."""
+    return {
+        "$schema": "https://vega.github.io/schema/vega-lite/v6.json",
+        "vconcat": list(rows),
+        "spacing": 6,
+        "usermeta": {"embedOptions": {"renderer": "svg", "actions": False}},
+        "config": look(),
+    }
+
+
+def look() -> Spec:
+    """Fonts and lines of the charts."""
+    return {
+        "font": FONT,
+        "view": {"stroke": "#CCCCCC"},
+        "axis": {"gridColor": "#EEEEEE", "titleFontWeight": "normal"},
+        "title": {"fontSize": 11, "fontWeight": "normal"},
+    }

@@ -14,7 +14,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from figures import closed_loop, panels, style
-from figures.explore import is_comparison
+from figures.choose import is_comparison
 from figures.sweep import wear
 from jaxmpc.errors import InputError
 from jaxmpc.loop.trajectory import Trajectory

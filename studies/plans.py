@@ -80,13 +80,14 @@ def _finished(data: xr.Dataset, controller: str) -> xr.Dataset:
 
 
 def _sample_moves(run: xr.Dataset, blocks: np.ndarray) -> np.ndarray:
-    """Moves of the Hu samples, ``"sample mv"``, from block moves ``"block mv"``."""
-    lengths = run.block_length.values
-    blocks, lengths = blocks[lengths > 0], lengths[lengths > 0]
-    if str(run.blocking.values) != "inputs":  # a move is made again in every sample of its block
-        return np.repeat(blocks, lengths, axis=0)
-    out = np.zeros((int(lengths.sum()), blocks.shape[1]))
-    out[np.cumsum(lengths) - lengths] = blocks
+    """Moves of the Hu samples, ``"sample mv"``, from block moves ``"block mv"``; MVs may have blocks of their own."""
+    lengths = np.broadcast_to(run.block_length.values.reshape(len(blocks), -1), blocks.shape)
+    out = np.zeros((int(lengths[:, 0].sum()), blocks.shape[1]))
+    for i, own in enumerate(lengths.T):
+        if str(run.blocking.values) == "inputs":
+            out[(np.cumsum(own) - own)[own > 0], i] = blocks[own > 0, i]
+        else:  # a move is made again in every sample of its block
+            out[:, i] = np.repeat(blocks[:, i], own)
     return out
 
 

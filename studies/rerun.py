@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
-from identify.plants import disturbance_of, open_plant
+from identify.plants import closing, disturbance_of, open_plant
 from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
 from jaxmpc.files import from_strict_json, write_atomically
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.trajectory import AXES, Trajectory
+from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.process import Process
 from studies.definition.models import identify_models
-from studies.definition.scenarios import Study
+from studies.definition.scenarios import Scenario, Study
 from studies.definition.sweep import StudyDefinition
 from studies.load import expand
 from studies.search.study import SearchStudy
@@ -102,25 +104,7 @@ def rerun(store: Path, number: int) -> Rerun:
         warnings.warn(
             f"scenario {number} was stored by other code or inputs; it may differ now", stacklevel=2
         )
-    process, plant = study.process, study.definition.study.plant
-    model = identify_models(process, [scenario.model_point])[scenario.model_point]
-    # arrays: no program of its own for every scenario
-    parameters = {name: np.float64(value) for name, value in scenario.plant.items()}
-    controlled = open_plant(process, plant, actual=scenario.actuator == "step", parameters=parameters)
-    offsets = scenario.disturbance
-    trajectory = simulate(
-        Controller(scenario.structure, scenario.tuning, model),
-        controlled,
-        scenario.reference,
-        samples=scenario.samples,
-        disturbance=None if offsets is None else disturbance_of(process, controlled, offsets),
-        noise=scenario.noise,
-        faults=scenario.faults,
-        position_feedback=scenario.position_feedback,
-        preview=scenario.preview,
-        events=scenario.events,
-        seed=scenario.seed,
-    )
+    process, trajectory = study.process, close_loop(study, scenario)
     shown = lambda value: f"{value:g}" if isinstance(value, float) else value  # noqa: E731
     values = [
         f"{c.key} = {shown(c.values[number])}{f' {c.unit}' if c.unit not in ('', '1') else ''}"
@@ -130,3 +114,45 @@ def rerun(store: Path, number: int) -> Rerun:
     return Rerun(
         trajectory, np.asarray(scenario.tuning.deadzone), title, scenario.kind, scenario.actuator, process
     )
+
+
+def close_loop(
+    study: Study,
+    scenario: Scenario,
+    model: StepResponseModel | None = None,
+    *,
+    keep_plans: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Trajectory:
+    """Run one scenario of a study, alone.
+
+    Args:
+        model: that of its working point; identified if not given.
+        keep_plans, progress: as in `jaxmpc.loop.simulate.simulate`.
+
+    Raises:
+        InputError: for a plant that cannot be opened, or a working point without a model.
+    """
+    process, offsets = study.process, scenario.disturbance
+    if model is None:
+        model = identify_models(process, [scenario.model_point])[scenario.model_point]
+    # arrays: no program of its own for every scenario
+    parameters = {name: np.float64(value) for name, value in scenario.plant.items()}
+    actual = scenario.actuator == "step"
+    opened = open_plant(process, study.definition.study.plant, actual=actual, parameters=parameters)
+    with closing(opened) as plant:
+        return simulate(
+            Controller(scenario.structure, scenario.tuning, model),
+            plant,
+            scenario.reference,
+            samples=scenario.samples,
+            disturbance=None if offsets is None else disturbance_of(process, plant, offsets),
+            noise=scenario.noise,
+            faults=scenario.faults,
+            position_feedback=scenario.position_feedback,
+            preview=scenario.preview,
+            events=scenario.events,
+            seed=scenario.seed,
+            keep_plans=keep_plans,
+            progress=progress,
+        )

@@ -9,6 +9,9 @@ from jaxmpc.cli.options import Options, command, option, switch
 
 @command(
     "explore",
+    option(
+        "process", "PROCESS", "a process file, or a shipped process (default: the thesis's)", str, nargs="?"
+    ),
     option("--store", "PATH", "study to open on the second page", Path),
     option("--port", "N", "of the local server (default: a free one)", int),
     switch("--headless", "only serve and print the address"),
@@ -21,4 +24,4 @@ def explore(options: Options) -> int:
     """
     from studies.notebooks.launch import explore
 
-    return explore(options.port, options.headless, options.store)
+    return explore(options.process or "", options.port, options.headless, options.store)

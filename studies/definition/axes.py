@@ -82,7 +82,7 @@ class AxisTable:
 
 
 def expand_axes(definition: StudyDefinition, *, confirmed: bool = False) -> AxisTable:
-    """The scenarios of a definition as entries of its axes; grids run through the last axis first.
+    """The scenarios of a definition as entries of its axes; grids run through the last axis first, no axes give one.
 
     Axes with a distribution are drawn together; in a sampled study every combination of the other axes meets every draw.
 
@@ -101,6 +101,8 @@ def expand_axes(definition: StudyDefinition, *, confirmed: bool = False) -> Axis
         entries = [_listed(definition)]
         check_count(definition, len(entries[0]), confirmed)
         return AxisTable(tuple(entries), _combine(method, entries))
+    if not axes and method == "grid":  # nothing varies: the base alone
+        return AxisTable((), np.zeros((1, 0), dtype=int))
     require(axes, "axes", "nothing", "one axis or more, each headed [[axes]]")
     heads = [_head(axis, place, definition.fields) for axis, place in zip(axes, places, strict=True)]
     _refuse_repeats([(f"{head.place}.key", field.key) for head in heads for field in head.fields])

@@ -1,7 +1,8 @@
 """The interactive app: a closed loop whose controls answer at once, and a page that opens study stores.
 
 ``jaxmpc explore`` serves it. As a script, ``python -m studies.notebooks.explore``, it runs once and prints key figures.
-Computing is in `studies.notebooks.loop`, drawing in `figures.explore`; here are only controls and where things go.
+Computing is in `studies.notebooks.loop`, the controls of a process in `controls`, drawing in `figures.explore` and
+`figures.choose`; here is only where things go.
 """
 
 import marimo
@@ -19,25 +20,31 @@ def _():
 
 @app.cell
 def _(mo):
+    _request = mo.app_meta().request
+    meta = _request.meta if _request is not None else {}
+    if "first" in meta:
+        meta["first"].loaded.wait()
+
+    from figures import choose, closed_loop
     from figures import explore as draw
-    from jaxmpc import html
     from jaxmpc.errors import InputError
-    from studies.definition import presets
+    from studies.notebooks import controls, export
     from studies.notebooks import loop as explore
 
-    # Ratios to the preset's own value, so that one slider serves values of any size.
-    RATIOS = [2.0**k for k in range(-5, 6)]
+    def vega(spec):
+        """A chart on the page, whose selections can be read."""
+        return mo.ui.altair_chart(draw.altair_of(spec), chart_selection=False, legend_selection=False)
+
     SLIDER = {"show_value": True, "debounce": True, "full_width": True}
-    _request = mo.app_meta().request
-    given_store = str(_request.meta.get("store", "")) if _request is not None else ""
-    return InputError, RATIOS, SLIDER, draw, explore, given_store, html, presets
+    return InputError, SLIDER, choose, closed_loop, controls, draw, explore, export, meta, vega
 
 
 @app.cell
 def _(mo):
     page = mo.ui.radio(["Run a loop", "Open a study"], value="Run a loop", inline=True)
-    get_pinned, set_pinned = mo.state(None)
-    return get_pinned, page, set_pinned
+    get_pins, set_pins = mo.state(())
+    kept = {"texts": {}, "zoom": None}  # what the user has set in controls that are made anew
+    return get_pins, kept, page, set_pins
 
 
 @app.cell
@@ -50,9 +57,11 @@ def _(mo):
     from jaxmpc.programs.compilation import told
 
     @contextlib.contextmanager
-    def compilation_shown():
+    def compilation_shown(said=()):
         """Shows in its cell that something is compiled meanwhile; no threads but marimo's own reach the page."""
         lines = queue.SimpleQueue()
+        for line in said:
+            lines.put(line)
 
         def show():
             for line in iter(lines.get, None):
@@ -72,47 +81,47 @@ def _(mo):
 
 
 @app.cell
-def _(explore, mo, presets):
-    controller = mo.ui.dropdown(list(explore.CONTROLLERS), value="mixed-integer")
-    preset = mo.ui.dropdown(list(presets.TUNINGS), value="thesis")
-    blocking = mo.ui.dropdown(list(explore.BLOCKING), value="moves")
-    length = mo.ui.dropdown({"30 min": False, "22 h": True}, value="30 min")
-    soft = mo.ui.switch(value=True, label="Soft MPC")
+def _(InputError, compilation_shown, explore, meta, mo):
+    try:
+        with compilation_shown(meta["first"].said if "first" in meta else ()):
+            explored = meta["first"].explorer() if "first" in meta else explore.explorer()
+    except InputError as error:
+        mo.stop(True, mo.callout(str(error), kind="warn"))
+    return (explored,)
+
+
+@app.cell
+def _(controls, explored, mo):
     # Shown by the cell that makes them, as all controls are: a cell that only lays them out would run, and draw every
     # one of them again, whenever one is moved.
+    choices = mo.ui.dictionary(
+        {
+            name: mo.ui.dropdown(options, value=next(iter(options)))
+            for name, options in controls.choices(explored).items()
+        }
+    )
+    soft = mo.ui.switch(value=True, label="Soft MPC")
+    _rows = "".join(f"<span>{name}</span>{element}" for name, element in choices.elements.items())
     choices_panel = mo.vstack(
         [
+            mo.md(f"**{explored.process.title or explored.process.name}**"),
             mo.Html(
                 '<div style="display:grid;grid-template-columns:auto 1fr;gap:0 1rem;align-items:center;'
-                f'font-size:0.9rem"><span>controller</span>{controller}<span>preset</span>{preset}'
-                f"<span>blocking</span>{blocking}<span>length</span>{length}</div>"
+                f'font-size:0.9rem">{_rows}</div>'
             ),
             soft,
         ],
         gap=0.4,
     )
-    return blocking, choices_panel, controller, length, preset, soft
+    return choices, choices_panel, soft
 
 
 @app.cell
-def _(RATIOS, SLIDER, mo, preset, presets):
-    _fields = presets.TUNINGS[preset.value]
-
-    def _slider(label, value, unit, steps=None):
-        steps = steps or [float(f"{ratio * value:.4g}") for ratio in RATIOS]
-        return mo.ui.slider(steps=steps, value=value, label=f"{label} [{unit}]", **SLIDER)
-
+def _(SLIDER, choices, controls, explored, mo):
     tuning = mo.ui.dictionary(
         {
-            "choke_weight": _slider("choke move weight", _fields["move_weight"]["choke"], "1/%²"),
-            "oil_deadzone": _slider(
-                "oil deadzone", _fields["deadzone"]["oil_rate"], "m³/h", [0.5 * k for k in range(41)]
-            ),
-            "gas_deadzone": _slider(
-                "gas deadzone", _fields["deadzone"]["gas_rate"], "m³/h", [100.0 * k for k in range(31)]
-            ),
-            "oil_weight": _slider("oil weight", _fields["cv_weight"]["oil_rate"], "1/(m³/h)²"),
-            "gas_weight": _slider("gas weight", _fields["cv_weight"]["gas_rate"], "1/(m³/h)²"),
+            key: mo.ui.slider(steps=slider.steps, value=slider.value, label=slider.label, **SLIDER)
+            for key, slider in controls.tuning_sliders(explored, choices.value["preset"]).items()
         }
     )
     tuning_panel = mo.vstack(list(tuning.elements.values()), gap=0.4)
@@ -120,29 +129,63 @@ def _(RATIOS, SLIDER, mo, preset, presets):
 
 
 @app.cell
-def _(SLIDER, explore, mo):
-    def _slider(start, stop, step, value, label):
-        return mo.ui.slider(start, stop, step, value=value, label=label, **SLIDER)
-
+def _(SLIDER, controls, explore, explored, mo):
     scenario = mo.ui.dictionary(
         {
-            "oil_setpoint": _slider(80, 240, 1, 152, "oil setpoint [m³/h]"),
-            "gas_setpoint": _slider(5000, 17000, 20, 9640, "gas setpoint [m³/h]"),
-            "pressure": _slider(-4, 4, 0.25, 0, "reservoir pressure change [bar]"),
-            "pressure_time": _slider(0, 1790, 10, 900, "from [s]"),
-            "model_choke": _slider(6, 96, 2, 50, "model: choke [%]"),
-            "model_lift": _slider(2500, 9500, 250, 7500, "model: lift [m³/h]"),
+            key: mo.ui.slider(steps=slider.steps, value=slider.value, label=slider.label, **SLIDER)
+            for key, slider in controls.scenario_sliders(explored).items()
         }
     )
-    _sliders = list(scenario.elements.values())
-    setpoint_panel = mo.vstack([mo.md(f"**Setpoints** from {explore.STEP_TIME:g} s"), *_sliders[:2]], gap=0.4)
-    model_panel = mo.accordion({"Disturbance and model": mo.vstack(_sliders[2:], gap=0.4)})
+    _of = lambda *heads: [e for key, e in scenario.elements.items() if key.startswith(heads)]  # noqa: E731
+    _from = f"**Setpoints** from {explore.STEP * explored.process.dt:g} s"
+    setpoint_panel = mo.vstack([mo.md(_from), *_of("setpoint.")], gap=0.4)
+    _more = _of("disturbance.", "model.")
+    model_panel = mo.accordion({"Disturbances and model": mo.vstack(_more, gap=0.4)}) if _more else mo.md("")
     return model_panel, scenario, setpoint_panel
 
 
 @app.cell
-def _(choices_panel, length, mo, model_panel, page, setpoint_panel, tuning_panel):
-    _step = [] if length.value else [setpoint_panel]
+def _(controls, explored, mo):
+    _rows = controls.further_fields(explored)
+    fields = mo.ui.table(
+        _rows,
+        selection="multi",
+        pagination=True,
+        page_size=8,
+        show_download=False,
+        show_column_summaries=False,
+        show_data_types=False,
+        wrapped_columns=["setting"],
+        label="Every other setting: search, tick, and set it below",
+    )
+    return (fields,)
+
+
+@app.cell
+def _(choices, controls, explored, fields, kept, mo):
+    def _text(key, label, start):
+        return mo.ui.text(
+            value=kept["texts"].get(key, start),
+            label=label,
+            full_width=True,
+            on_change=lambda text: kept["texts"].update({key: text}),
+        )
+
+    further = mo.ui.dictionary(
+        {
+            key: _text(key, label, start)
+            for key, label, start in controls.chosen_fields(
+                explored, choices.value["preset"], [row["key"] for row in fields.value]
+            )
+        }
+    )
+    further_panel = mo.vstack([fields, *further.elements.values()], gap=0.4)
+    return further, further_panel
+
+
+@app.cell
+def _(choices, mo, model_panel, page, setpoint_panel, tuning_panel, choices_panel):
+    _step = [] if choices.value["run"] else [setpoint_panel]
     _shown = [choices_panel, tuning_panel, *_step, model_panel] if page.value == "Run a loop" else []
     # panels are as high as what is in them; by themselves they would share the height of the page evenly
     _panels = [panel.style(flex="none") for panel in _shown]
@@ -154,13 +197,13 @@ def _(choices_panel, length, mo, model_panel, page, setpoint_panel, tuning_panel
 def _(
     Clock,
     InputError,
-    blocking,
+    choices,
     compilation_shown,
-    controller,
+    controls,
     explore,
-    length,
+    explored,
+    further,
     mo,
-    preset,
     scenario,
     soft,
     time,
@@ -168,129 +211,193 @@ def _(
 ):
     run, refused = None, None
     try:
-        _settings = explore.Settings(
-            controller=controller.value,
-            preset=preset.value,
-            soft=soft.value,
-            blocking=blocking.value,
-            whole=length.value,
-            **tuning.value,
-            **scenario.value,
+        _base = controls.base_of(
+            explored, choices.value, soft.value, tuning.value, scenario.value, further.value
         )
-        if length.value:
+        if choices.value["run"]:
             with (
                 compilation_shown(),
-                mo.status.progress_bar(total=7800, title="22 h", show_eta=True, remove_on_exit=True) as _bar,
+                mo.status.progress_bar(
+                    total=1, title=choices.value["run"], show_eta=True, remove_on_exit=True
+                ) as _bar,
             ):
-                _done, _clock = [0], Clock()
+                _done, _clock = [0.0], Clock()
 
                 def _report(done, total):
                     _bar.start_time = time.time() - _clock.seconds
-                    _bar.update(increment=done - _done[0])
-                    _done[0] = done
+                    _bar.update(increment=done / total - _done[0])
+                    _done[0] = done / total
 
-                run = explore.run(_settings, _report)
+                run = explore.run(explored, _base, _report)
         else:
             with compilation_shown():
-                run = explore.run(_settings)
+                run = explore.run(explored, _base)
     except InputError as error:
         refused = mo.callout(str(error), kind="warn")
     return refused, run
 
 
 @app.cell
-def _(SLIDER, length, mo):
-    _last = 77990 if length.value else 1790
-    plan_time = mo.ui.slider(0, _last, 10, value=300, label="plan made at [s]", **SLIDER)
+def _(SLIDER, explored, mo, run):
+    _dt, _samples = explored.process.dt, 180 if run is None else run.trajectory.samples
+    plan_time = mo.ui.slider(
+        0, (_samples - 1) * _dt, _dt, value=min(30, _samples - 1) * _dt, label="plan made at [s]", **SLIDER
+    )
     return (plan_time,)
 
 
 @app.cell
-def _(mo, run, set_pinned):
-    pin = mo.ui.button(label="Pin this run", on_click=lambda _: set_pinned(run), disabled=run is None)
-    unpin = mo.ui.button(label="Unpin", on_click=lambda _: set_pinned(None))
-    return pin, unpin
+def _(controls, get_pins, mo, run, set_pins):
+    pin_name = mo.ui.text(value=controls.free_name(get_pins()), label="as", full_width=False)
+    pin = mo.ui.button(
+        label="Pin this run",
+        on_click=lambda _: set_pins(lambda pins: controls.pinned(pins, pin_name.value, run)),
+        disabled=run is None,
+    )
+    unpin = mo.ui.array(
+        [
+            mo.ui.button(
+                label=f"Unpin {one.name}",
+                on_click=lambda _, name=one.name: set_pins(lambda pins: controls.unpinned(pins, name)),
+            )
+            for one in get_pins()
+        ]
+    )
+    return pin, pin_name, unpin
 
 
 @app.cell
-def _(draw, explore, get_pinned, html, mo, page, pin, refused, run, unpin):
+def _(controls, draw, get_pins, kept, page, run, vega):
+    chart = None
+    if run is not None and page.value == "Run a loop":
+        _spec = draw.tracking(controls.shown(run, get_pins()), zoom=kept["zoom"])
+        chart = vega(_spec)
+    return (chart,)
+
+
+@app.cell
+def _(chart, kept):
+    if chart is not None:  # the next chart is zoomed in as this one is
+        kept["zoom"] = (chart.selections.get("zoom") or {}).get("t")
+    return
+
+
+@app.cell
+def _(chart, draw, export, controls, get_pins, mo, page, pin, pin_name, refused, run, unpin):
     def _view():
         if run is None:
             return refused
-        pinned = get_pinned()
-        figure = draw.tracking(run.data, pinned=None if pinned is None else pinned.data)
-        rows, runs = [], [run] if pinned is None else [run, pinned]
-        for figures in zip(*map(explore.shown_figures, runs), strict=True):
-            (now, shown), *before = (explore.written(value, unit) for _, unit, value in figures)
-            old = (number if unit == shown else f"{number} {unit}" for number, unit in before)
-            rows.append([figures[0][0], now, *old, shown])
-        head = ["", *("now", "pinned")[: len(runs)], ""]
+        runs, colours = controls.named(run, get_pins())
         side = [
             mo.Html(
                 '<div id="key-figures" style="font-size:12px;line-height:1.3;white-space:nowrap">'
-                f"{html.table(head, rows)}</div>"
+                f"{export.figures_table(runs, colours)}</div>"
             ),
-            mo.hstack([pin, unpin], justify="start"),
+            mo.hstack([pin, pin_name], justify="start", widths=[1, 1], align="center"),
+            mo.hstack(list(unpin.elements), justify="start", wrap=True),
             mo.md(f"<small>run and key figures: {run.seconds:.2f} s</small>"),
         ]
-        image = mo.Html(draw.image(figure, "the run"))
-        return mo.hstack([image, mo.vstack(side, gap=0.3)], widths=[2.15, 1], align="start", gap=0.75)
+        drawn = mo.vstack([chart, mo.md(f"<small>{draw.CAPTION}</small>")], gap=0.1)
+        return mo.hstack([drawn, mo.vstack(side, gap=0.3)], widths=[2.15, 1], align="start", gap=0.75)
 
     _view() if page.value == "Run a loop" else None
     return
 
 
 @app.cell
-def _(draw, mo, page, plan_time, run):
+def _(controls, export, get_pins, mo, page, run):
     def _view():
-        figure = draw.planned(run.data, float(plan_time.value))
-        return mo.vstack([plan_time, mo.Html(draw.image(figure, "the plan"))], gap=0.3)
+        runs, colours = controls.named(run, get_pins())
+        return mo.Html(
+            f'<div id="differences" style="font-size:12px">{export.differences_table(runs, colours)}</div>'
+        )
+
+    _view() if page.value == "Run a loop" and run is not None and get_pins() else None
+    return
+
+
+@app.cell
+def _(further_panel, mo, page):
+    mo.accordion({"All settings": further_panel}) if page.value == "Run a loop" else None
+    return
+
+
+@app.cell
+def _(draw, mo, page, plan_time, run, vega):
+    def _view():
+        return mo.vstack([plan_time, vega(draw.planned(run.data, float(plan_time.value)))], gap=0.3)
 
     _view() if page.value == "Run a loop" and run is not None else None
     return
 
 
 @app.cell
-def _(given_store, mo):
+def _(controls, export, get_pins, mo, page, run):
+    def _view():
+        runs, colours = controls.named(run, get_pins())
+        toml, python = export.as_toml(run), export.as_python(run)
+        downloads = [
+            mo.download(toml.encode(), "explored.toml", "application/toml", label="TOML"),
+            mo.download(python.encode(), "tuning.py", "text/x-python", label="Python"),
+            mo.download(
+                lambda: export.as_page(runs, colours).encode(),
+                "runs.html",
+                "text/html",
+                label="Page of these runs",
+            ),
+        ]
+        shown = mo.accordion(
+            {"As a study file": mo.md(f"```toml\n{toml}```"), "As Python": mo.md(f"```python\n{python}```")}
+        )
+        return mo.vstack([mo.hstack(downloads, justify="start"), shown], gap=0.3)
+
+    _view() if page.value == "Run a loop" and run is not None else None
+    return
+
+
+@app.cell
+def _(meta, mo):
     path = mo.ui.text(
-        value=given_store, label="study store", full_width=True, placeholder="results/deadzone.zarr"
+        value=meta.get("store", ""), label="study store", full_width=True, placeholder="results/deadzone.zarr"
     )
     return (path,)
 
 
 @app.cell
-def _(InputError, draw, mo, path):
-    table, chart, trouble = None, None, mo.md("Path of a sweep (`….zarr`) or of a comparison (its folder).")
+def _(InputError, choose, mo, path):
+    table, scatter, trouble = None, None, mo.md("Path of a sweep (`….zarr`) or of a comparison (its folder).")
     if path.value.strip():
         try:
-            table = draw.points(path.value.strip())
-            chart = mo.ui.altair_chart(draw.scatter(table), chart_selection="point", legend_selection=False)
+            table = choose.points(path.value.strip())
+            scatter = mo.ui.altair_chart(
+                choose.scatter(table), chart_selection="point", legend_selection=False
+            )
         except InputError as error:
             trouble = mo.callout(str(error), kind="warn")
-    return chart, table, trouble
+    return scatter, table, trouble
 
 
 @app.cell
-def _(chart, mo, page, path, trouble):
-    mo.vstack([path, chart if chart is not None else trouble]) if page.value == "Open a study" else None
+def _(mo, page, path, scatter, trouble):
+    mo.vstack([path, scatter if scatter is not None else trouble]) if page.value == "Open a study" else None
     return
 
 
 @app.cell
-def _(chart, draw, mo, path):
+def _(choose, mo, path, scatter):
     picked = None
-    if chart is not None and 0 < len(chart.value) < len(chart.dataframe):  # all of them: none is picked
-        picked = chart.value.iloc[0]
+    if scatter is not None and 0 < len(scatter.value) < len(scatter.dataframe):  # all of them: none is picked
+        picked = scatter.value.iloc[0]
     again = mo.ui.run_button(
         label="Run it in full",
         tooltip="closes this loop again and shows every sample",
-        disabled=picked is None or draw.is_comparison(path.value.strip()),
+        disabled=picked is None or choose.is_comparison(path.value.strip()),
     )
     return again, picked
 
 
 @app.cell
-def _(InputError, again, compilation_shown, draw, mo, page, path, picked):
+def _(InputError, again, choose, closed_loop, compilation_shown, draw, mo, page, path, picked, vega):
     def _view():
         if picked is None:
             return mo.md("Pick a point to see its run.")
@@ -299,19 +406,20 @@ def _(InputError, again, compilation_shown, draw, mo, page, path, picked):
             if again.value:
                 from pathlib import Path
 
-                from figures.closed_loop import of_trajectory
                 from studies.rerun import rerun
 
                 with compilation_shown(), mo.status.spinner("running"):
                     found = rerun(Path(store), number)
-                data = of_trajectory(found.trajectory, found.deadzone, found.kind, found.actuator)
+                data = closed_loop.of_trajectory(
+                    found.trajectory, found.deadzone, found.kind, found.actuator, found.process
+                )
             else:
-                data = draw.stored(store, number)
+                data = choose.stored(store, number)
         except InputError as error:
             return mo.callout(str(error), kind="warn")
-        image = mo.Html(draw.image(draw.tracking(data, wide=True), "the picked run"))
+        drawn = vega(draw.tracking([draw.Shown("the picked run", draw.COLOURS[0], data)], width=800))
         title = mo.md(f"**{number}**: {picked['run']}")
-        return mo.vstack([mo.hstack([title, again], widths=[5, 1]), image], gap=0.3)
+        return mo.vstack([mo.hstack([title, again], widths=[5, 1]), drawn], gap=0.3)
 
     _view() if page.value == "Open a study" else None
     return

@@ -18,10 +18,12 @@ import tempfile
 import threading
 import webbrowser
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
 from jaxmpc.errors import InputError, MissingToolError
+from jaxmpc.process.file import load_process
 from jaxmpc.programs.interrupts import in_the_end
 from studies.notebooks.guard import TOKEN, Guard
 
@@ -30,12 +32,18 @@ LOOPBACK = "127.0.0.1"
 LOOK = 1.0  # s between looks at who has started this process
 
 
-def explore(port: int | None = None, headless: bool = False, store: str | Path | None = None) -> int:
+def explore(
+    process: str | Path = "",
+    port: int | None = None,
+    headless: bool = False,
+    store: str | Path | None = None,
+) -> int:
     """Serve the app on this machine until it is stopped; its address is printed.
 
     It also ends with the process that has started this one, unless a closed terminal is ignored (``nohup``).
 
     Args:
+        process: to explore, a shipped one or a process file; the default one if not given.
         port: of the page; a free one if not given.
         headless: whether not to open a browser.
         store: study store that the second page opens.
@@ -44,7 +52,8 @@ def explore(port: int | None = None, headless: bool = False, store: str | Path |
         1 where the server has ended by itself, or nobody is left who could stop it.
 
     Raises:
-        InputError: for a port that does not exist or is in use, or a store that is not there; before anything is served.
+        InputError: for a process that cannot be read, a port that does not exist or is in use, or a store that is not there;
+            before anything is served.
         MissingToolError: if marimo is not installed.
     """
     if port is not None and not 1 <= port <= 65535:
@@ -54,16 +63,56 @@ def explore(port: int | None = None, headless: bool = False, store: str | Path |
     for tool in ("marimo", "altair"):
         if importlib.util.find_spec(tool) is None:
             raise MissingToolError(f"The app needs {tool}: pip install 'jaxmpc[notebook]'")
+    if process:
+        load_process(process)
     parent = os.getppid()
     with _listen(port) as listening, _letter(headless) as letter:
         token, own_port = secrets.token_urlsafe(32), listening.getsockname()[1]
         address = f"http://{LOOPBACK}:{own_port}/?{TOKEN}={token}"
-        meta = {"store": "" if store is None else str(Path(store).resolve())}
-        serving = _serve(Guard(_app(), own_port, token, meta, entered=letter.close), listening)
+        app = _app()
+        meta = {"store": "" if store is None else str(Path(store).resolve()), "first": First(process)}
+        serving = _serve(Guard(app, own_port, token, meta, entered=letter.close), listening)
         print(f"jaxmpc: {address}", flush=True)
         letter.send(address)
         _wait(serving, parent)
     return 1
+
+
+class First:
+    """The first run of the app, made while a browser opens: modules and programs are loaded when the page asks for them.
+
+    Attributes:
+        said: lines about compilation that nobody has heard yet.
+        loaded: set when its modules are imported, which two threads must not do at once.
+    """
+
+    def __init__(self, process: str | Path = ""):
+        self.said: list[str] = []
+        self.loaded = threading.Event()
+        self._found: Future[Any] = Future()
+        threading.Thread(target=self._run, args=(process,), daemon=True).start()
+
+    def explorer(self) -> Any:
+        """The process, as soon as its first run is made.
+
+        Raises:
+            InputError: for a process that cannot be run.
+        """
+        return self._found.result()
+
+    def _run(self, process: str | Path) -> None:
+        try:
+            from jaxmpc.programs.compilation import told
+            from studies.notebooks import controls, loop
+
+            self.loaded.set()
+            with told(self.said.append):
+                explored = loop.explorer(process or loop.DEFAULT_PROCESS)
+                loop.run(explored, controls.first_base(explored))
+            self._found.set_result(explored)
+        except BaseException as error:  # whoever waits for it gets it
+            self.loaded.set()
+            self._found.set_exception(error)
 
 
 def _listen(port: int | None) -> socket.socket:

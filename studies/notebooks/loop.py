@@ -1,7 +1,8 @@
-"""One closed loop on the JAX well from a handful of settings, with key figures and every plan: what the app computes.
+"""One closed loop of any process from the keys of studies, with key figures and every plan: what the app computes.
 
-Only numbers change from one run to the next as long as controller, blocking and length stay the same, so that nothing
-is compiled again. `main` prints the key figures of a run.
+A run is a study without axes: its settings are a base table, checked, named and refused as in a definition file. Only
+numbers change from one run to the next as long as the structure and the length stay the same, so that nothing is compiled
+again. `main` prints the key figures of a run.
 """
 
 from __future__ import annotations
@@ -11,255 +12,286 @@ import dataclasses
 import functools
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from figures.closed_loop import RUN, of_trajectory
-from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
-from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.trajectory import RECORDABLE, Trajectory, TrajectoryBatch
 from jaxmpc.model.step_response import StepResponseModel
-from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.problem.tuning import Tuning
-from jaxmpc.process.reference import Reference
-from jaxmpc.process.well.plant import WellPlant
-from studies.definition import presets, references
-from studies.definition.models import identify_models
-from studies.kpi.sweep import KPIS, RECORD, batch_kpis
-from studies.thesis.well import CHOKE, GAS, OIL
+from jaxmpc.process.file import shipped_processes
+from jaxmpc.process.process import Process
+from studies.definition.fields import Field, find
+from studies.definition.models import Point, identify_models
+from studies.definition.scenarios import Scenario, expand_sweep
+from studies.definition.sections import DEFAULT_PROCESS
+from studies.definition.sweep import StudyDefinition, settings
+from studies.kpi.sweep import RECORD, batch_kpis, kpis_of, measures_of
+from studies.rerun import close_loop
 
 Progress = Callable[[int, int], None]
+Base = Mapping[str, Any]  # the table [base] of a study
 
-CONTROLLERS = {  # kind of the controller and of the choke
-    "continuous": ("continuous", "continuous"),
-    "rounded": ("continuous", "step"),
-    "mixed-integer": ("mixed-integer", "step"),
-}
-BLOCKING = ("moves", "inputs", "none")
-CHOICES = {"controller": tuple(CONTROLLERS), "preset": tuple(presets.TUNINGS), "blocking": BLOCKING}
-START = references.THESIS_WINDOWS[0][1:]  # gas and oil setpoint at the working point [m3/h]
-STEP_TIME = 300.0  # s, when the setpoints of a short run change
-SHORT = 1800.0  # s, length of a short run
-
-# The key figures that are shown, with the words for them; the part behind the dot is a CV.
-SHOWN = {
-    "choke_travel": "choke travel",
-    "choke_moves": "choke moves",
-    "choke_reversals": "choke reversals",
-    "lift_travel": "lift travel",
-    f"mean_absolute_deviation.{OIL}": "mean deviation, oil",
-    f"mean_absolute_deviation.{GAS}": "mean deviation, gas",
-    f"time_outside_deadzone.{OIL}": "outside deadzone, oil",
-    f"time_outside_deadzone.{GAS}": "outside deadzone, gas",
-    "oil_produced": "oil produced",
-    "closed_loop_cost": "cost per sample",
-    "solve_time_median": "solve time, median",
-    "solve_time_max": "solve time, longest",
-    "largest_gap": "largest gap",
-    "not_optimal": "not optimal",
-}
+STEP, SHORT = 30, 180  # samples: when the setpoints of a short run change, and how long it is
+MOST_MOVES = 64  # of stepped MVs that are left to one another without blocks; a step with more takes seconds
 
 
-def _in(unit: str, default: float | None) -> Any:
-    """A number of `Settings` with its unit."""
-    return dataclasses.field(default=default, metadata={"unit": unit})
+@dataclasses.dataclass(frozen=True, eq=False)
+class Explorer:
+    """A process whose loops are run, and what the runs share; made by `explorer`.
 
+    Attributes:
+        definition: a study of the process, without settings.
+        models: those identified so far, by working point.
+    """
 
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    """What a run is made of; None takes the value of the preset."""
-
-    controller: str = "mixed-integer"  # a key of `CONTROLLERS`; "rounded" is continuous MPC on the step choke
-    preset: str = "thesis"  # a key of `studies.definition.presets.TUNINGS`
-    soft: bool = True  # False turns Soft MPC off: the weight of the deviation becomes Q + S, as in a sweep
-    blocking: str = "moves"  # one of `BLOCKING`
-    choke_weight: float | None = _in("1/%^2", None)  # of its moves
-    gas_weight: float | None = _in("1/(m3/h)^2", None)  # of the deviation
-    oil_weight: float | None = _in("1/(m3/h)^2", None)
-    gas_deadzone: float | None = _in("m3/h", None)  # half width
-    oil_deadzone: float | None = _in("m3/h", None)
-    model_choke: float = _in("%", 50.0)  # working point of the model
-    model_lift: float = _in("m3/h", 7500.0)
-    gas_setpoint: float = _in("m3/h", 9640.0)  # of a short run, from `STEP_TIME` on
-    oil_setpoint: float = _in("m3/h", 152.0)
-    pressure: float = _in("bar", 0.0)  # change of the reservoir pressure, the disturbance
-    pressure_time: float = _in("s", 900.0)  # from when on
-    whole: bool = False  # the whole reference of the thesis (22 h) instead of a short run
-
-    def __post_init__(self):
-        for field, known in CHOICES.items():
-            if getattr(self, field) not in known:
-                raise InputError(field, getattr(self, field), f"one of {', '.join(known)}")
-        if self.blocking == "none" and self.controller == "mixed-integer":
-            hint = "Without blocks a step with whole moves takes seconds; choose moves or inputs, or another controller"
-            raise InputError("blocking", "none", "blocks for whole moves", hint)
-        for field, unit in (("pressure", "bar"), ("pressure_time", "s")):
-            if not np.isfinite(getattr(self, field)):
-                raise InputError(field, getattr(self, field), f"a number [{unit}]")
+    definition: StudyDefinition
+    models: dict[Point, StepResponseModel] = dataclasses.field(default_factory=dict)
 
     @property
-    def structure(self) -> Structure:
-        """The checked structure."""
-        return presets.structure(self.blocking, integer=self.controller == "mixed-integer")  # type: ignore[arg-type]
+    def process(self) -> Process:
+        """That is controlled."""
+        return self.definition.process
 
     @property
-    def tuning(self) -> Tuning:
-        """The checked tuning."""
-        fields = presets.tuning_fields(self.preset)
-        given = {
-            "cv_weight": {GAS: self.gas_weight, OIL: self.oil_weight},
-            "deadzone": {GAS: self.gas_deadzone, OIL: self.oil_deadzone},
-            "move_weight": {CHOKE: self.choke_weight},
-        }
-        for key, values in given.items():
-            fields[key] |= {name: value for name, value in values.items() if value is not None}
-        if not self.soft:
-            both = {name: fields["cv_weight"][name] + fields["soft_quadratic"][name] for name in (GAS, OIL)}
-            off = {GAS: 0.0, OIL: 0.0}
-            fields |= {"cv_weight": both, "soft_quadratic": off, "soft_linear": off}
-        return presets.tuning(self.structure, self.preset, fields)
+    def fields(self) -> Mapping[str, Field]:
+        """The keys that a base may have, with label, unit, default and limits."""
+        return self.definition.fields
 
-    @property
-    def reference(self) -> Reference:
-        """The thesis run, or a short run that changes the setpoints once."""
-        if self.whole:
-            return references.thesis()
-        return Reference([0.0, STEP_TIME], [START, (self.gas_setpoint, self.oil_setpoint)], SHORT)
+    def model(self, point: Point) -> StepResponseModel:
+        """The model at a working point; kept for the next run."""
+        if point not in self.models:
+            self.models[point] = identify_models(self.process, [point])[point]
+        return self.models[point]
 
-    @property
-    def offsets(self) -> np.ndarray:
-        """Change of the reservoir pressure, ``"sample"`` [bar]."""
-        dt = presets.SAMPLING_INTERVAL
-        times = np.arange(self.reference.samples(dt)) * dt
-        return np.where(times >= self.pressure_time - 1e-9 * dt, self.pressure, 0.0)
+    def short_step(self, setpoints: Sequence[float] | None = None) -> dict[str, Any]:
+        """The table ``reference`` of a short run whose setpoints change once.
+
+        Args:
+            setpoints: from then on, per CV [CV unit]; the second ones of the default reference if not given.
+        """
+        known = np.asarray(self.process.reference().setpoints)
+        after = known[min(1, len(known) - 1)].tolist() if setpoints is None else list(setpoints)
+        dt = self.process.dt
+        return {"times": [0.0, STEP * dt], "setpoints": [known[0].tolist(), after], "duration": SHORT * dt}
+
+
+def explorer(process: str | Path = DEFAULT_PROCESS, plant: str = "") -> Explorer:
+    """A process to explore.
+
+    Args:
+        process: a shipped one by name, or a process file.
+        plant: one of its plants; the first if not given.
+
+    Raises:
+        InputError: for a process or plant that does not exist or cannot be opened.
+    """
+    named = str(process) if str(process) in shipped_processes() else str(Path(process).resolve())
+    return Explorer(
+        StudyDefinition.from_dict({"study": {"name": "explored", "process": named, "plant": plant}})
+    )
+
+
+def nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """A base table from values by key."""
+    out: dict[str, Any] = {}
+    for key, value in values.items():
+        *tables, name = key.split(".")
+        inner = out
+        for table in tables:
+            inner = inner.setdefault(table, {})
+        inner[name] = value
+    return out
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ExploreRun:
-    """A finished run."""
+    """A finished run.
 
-    settings: Settings
-    trajectory: Trajectory  # every sample, with its plans
-    kpis: dict[
-        str, float
-    ]  # every key figure of `studies.kpi.sweep`; ``name.channel`` where it is one per CV or MV
+    Attributes:
+        definition: the study without axes that it is.
+        scenario: its typed inputs.
+        trajectory: every sample, with its plans.
+        kpis: every key figure of `studies.kpi.sweep.kpis_of`; ``name.channel`` where it is one per CV or MV.
+        model: of the controller.
+        seconds: that it took, key figures included.
+    """
+
+    definition: StudyDefinition
+    scenario: Scenario
+    trajectory: Trajectory
+    kpis: dict[str, float]
     model: StepResponseModel
-    tuning: Tuning
-    structure: Structure
-    seconds: float  # that it took, key figures included
+    seconds: float
 
     @functools.cached_property
     def data(self) -> xr.Dataset:
         """The run as `studies.store.reading.open_results` would give it, with one controller `RUN`."""
-        t, structure, settings = self.trajectory, self.structure, self.settings
-        kind, actuator = CONTROLLERS[settings.controller]
+        t, scenario, structure = self.trajectory, self.scenario, self.scenario.structure
+        lengths = np.zeros((structure.block_count, structure.mv_count), dtype=int)
+        for i in range(structure.mv_count):
+            blocks = structure.blocks_of(i)
+            lengths[: len(blocks), i] = blocks
         known: dict[str, Any] = {
             "plan": (("controller", "time", "block", "mv"), np.asarray(t.plan)[None]),
-            "window": ("time", settings.reference.window(t.dt, t.samples)),
-            "disturbance": ("time", settings.offsets[: t.samples]),
+            "window": ("time", scenario.reference.window(t.dt, t.samples)),
             "model_coefficient": (("cv", "mv", "lag"), np.asarray(self.model.coefficients)),
-            "block_length": (("controller", "block"), np.array([structure.blocks])),
+            "block_length": (("controller", "block", "mv"), lengths[None]),
             "prediction_horizon": ("controller", [structure.prediction_horizon]),
             "complete": ("controller", [1]),
             "blocking": ("controller", [structure.blocking]),
         }
+        if scenario.disturbance is not None:
+            known["disturbance"] = (("time", "disturbance_name"), scenario.disturbance[: t.samples])
         for name in ("deadzone", "soft_quadratic", "soft_linear"):
-            known[f"tuning_{name}"] = (("controller", "cv"), np.asarray(getattr(self.tuning, name))[None])
-        definition = {"controllers": [{"name": RUN, "kind": kind, "actuator": actuator, "schedule": False}]}
-        run = of_trajectory(t, self.tuning.deadzone, kind, actuator)
-        return run.assign(known).assign_attrs(definition=json.dumps(definition))
+            known[f"tuning_{name}"] = (("controller", "cv"), np.asarray(getattr(scenario.tuning, name))[None])
+        own = {"name": RUN, "kind": scenario.kind, "actuator": scenario.actuator, "schedule": False}
+        run = of_trajectory(
+            t, scenario.tuning.deadzone, scenario.kind, scenario.actuator, self.definition.process
+        )
+        return run.assign(known).assign_attrs(definition=json.dumps({"controllers": [own]}))
 
 
-@functools.lru_cache(maxsize=64)
-def model_at(choke: float, lift: float) -> StepResponseModel:
-    """The model identified at a working point, choke [%] and gas lift [m3/h]; kept for the next run."""
-    (model,) = identify_models([(choke, lift)]).values()
-    return model
+def run(explored: Explorer, base: Base | None = None, progress: Progress | None = None) -> ExploreRun:
+    """Close the loop.
 
-
-def run(settings: Settings, progress: Progress | None = None) -> ExploreRun:
-    """Close the loop; `progress` is called with ``(done, total)`` samples.
+    Args:
+        explored: the process.
+        base: settings as in the table ``[base]`` of a study; a short run (`Explorer.short_step`) if it has no reference.
+        progress: called with ``(done, total)`` samples.
 
     Raises:
-        InputError: naming the field, for settings that no controller or well can have; before anything runs.
+        InputError: naming the key below ``base``, for settings that no controller or plant can have; before anything runs.
     """
     begin = time.perf_counter()
-    structure, tuning, reference = settings.structure, settings.tuning, settings.reference
-    model = model_at(float(settings.model_choke), float(settings.model_lift))
-    _, actuator = CONTROLLERS[settings.controller]
-    trajectory = simulate(
-        Controller(structure, tuning, model),
-        WellPlant(actuator=actuator),  # type: ignore[arg-type]
-        reference,
-        disturbance=settings.offsets,
-        keep_plans=True,
-        progress=progress,
+    process, fields = explored.process, explored.fields
+    given = {"reference": explored.short_step(), **(base or {})}
+    definition = dataclasses.replace(
+        explored.definition,
+        base=settings(given, "base", process, fields),
+        body={**explored.definition.body, "base": given},
     )
-    figures = key_figures(trajectory, tuning, reference.window(trajectory.dt, trajectory.samples))
-    seconds = time.perf_counter() - begin
-    return ExploreRun(settings, trajectory, figures, model, tuning, structure, seconds)
+    study = expand_sweep(definition)
+    scenario = study.scenario(0)
+    _check_size(scenario)
+    model = explored.model(scenario.model_point)
+    trajectory = close_loop(study, scenario, model, keep_plans=True, progress=progress)
+    figures = key_figures(process, trajectory, scenario)
+    return ExploreRun(definition, scenario, trajectory, figures, model, time.perf_counter() - begin)
 
 
-def key_figures(trajectory: Trajectory, tuning: Tuning, window: np.ndarray) -> dict[str, float]:
-    """Every key figure of a run by name, ``name.channel`` where it is one per CV or MV; window labels ``"sample"``."""
+def _check_size(scenario: Scenario) -> None:
+    structure = scenario.structure
+    whole = sum(structure.whole_blocks(mv) for mv in structure.integer_mvs)
+    if whole > MOST_MOVES and structure.block_count == structure.control_horizon:
+        expected = f"blocks, or at most {MOST_MOVES} whole moves (these are {whole})"
+        hint = "Without blocks a step with whole moves takes seconds; choose blocks or another controller"
+        raise InputError("base.blocking", "none", expected, hint)
+
+
+def key_figures(process: Process, trajectory: Trajectory, scenario: Scenario) -> dict[str, float]:
+    """Every key figure of a run by name, ``name.channel`` where it is one per CV or MV."""
     t = trajectory
     recorded = {name: np.asarray(getattr(t, name))[None] for name in RECORDABLE if name in RECORD}
     same = {name: getattr(t, name) for name in ("time", "cv_names", "mv_names", "cv_units", "mv_units", "dt")}
     batch = TrajectoryBatch(np.zeros(1, dtype=int), setpoint=t.setpoint[None], fields=recorded, **same)
-    values = batch_kpis(batch, tuning, window)
+    window = scenario.reference.window(t.dt, t.samples)
+    values = batch_kpis(batch, scenario.tuning, window, measures_of(process))
     out: dict[str, float] = {}
-    for item in KPIS:
+    for item in kpis_of(process):
         names = {(): ("",), ("cv",): t.cv_names, ("mv",): t.mv_names}[item.dims]
         for name, value in zip(names, np.atleast_1d(values[item.name][0]), strict=True):
             out[f"{item.name}.{name}" if name else item.name] = float(value)
     return out
 
 
-def shown_figures(run: ExploreRun) -> list[tuple[str, str, float]]:
-    """The key figures of `SHOWN`: words, unit, value."""
-    by_name = {item.name: item for item in KPIS}
-    return [
-        (words, by_name[key.partition(".")[0]].unit_of("m3/h"), run.kpis[key]) for key, words in SHOWN.items()
+def shown_figures(process: Process) -> list[tuple[str, str, str]]:
+    """The key figures that are shown: key, words, unit. Of stepped MVs, what wears them; of the others, their travel."""
+    shown: list[tuple[str, str]] = []
+    for i, mv in enumerate(process.mvs):
+        wear = ("travel", "moves", "reversals") if i in process.stepped else ("travel",)
+        shown += [(f"{name}.{mv.name}", f"{mv.label}, {name}") for name in wear]
+    for cv in process.cvs:
+        shown.append((f"mean_absolute_deviation.{cv.name}", f"{cv.label}, mean deviation"))
+        shown.append((f"time_outside_deadzone.{cv.name}", f"{cv.label}, outside deadzone"))
+    shown += [(figure.name, figure.label) for figure in process.key_figures]
+    shown += [
+        ("closed_loop_cost", "cost per sample"),
+        ("solve_time_median", "solve time, median"),
+        ("solve_time_max", "solve time, longest"),
+        ("largest_gap", "largest gap"),
+        ("not_optimal", "not optimal"),
     ]
+    items, units = {item.name: item for item in kpis_of(process)}, process.units
+    unit = lambda key: items[key.partition(".")[0]].unit_of(units.get(key.partition(".")[2], "1"))  # noqa: E731
+    return [(key, words, unit(key)) for key, words in shown]
 
 
 def written(value: float, unit: str) -> tuple[str, str]:
     """A key figure and its unit as they are printed: times below a second in ms, others as they are."""
     if unit == "s" and abs(value) < 1:
         value, unit = 1e3 * value, "ms"
-    number = f"{value:,.4g}" if abs(value) < 1e4 else f"{value:,.0f}"
+    number = f"{value:,.4g}" if not abs(value) >= 1e4 else f"{value:,.0f}"
     return number, "" if unit == "1" else unit.replace("m3", "m³")
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run once and print the key figures; every field of `Settings` is an option."""
-    parser = argparse.ArgumentParser(
-        prog="explore",
-        description="Close one loop and print its key figures.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-        allow_abbrev=False,
-    )
-    for field in dataclasses.fields(Settings):
-        option = f"--{field.name.replace('_', '-')}"
-        if isinstance(field.default, bool):
-            action = argparse.BooleanOptionalAction
-            parser.add_argument(option, action=action, default=field.default, help="-")
-        elif field.name in CHOICES:
-            parser.add_argument(option, choices=CHOICES[field.name], default=field.default, help="-")
+def in_force(done: ExploreRun) -> dict[str, Any]:
+    """What every key was set to in a run: what was given, else what the preset, the structure or the default says."""
+    base, tuning, structure = done.definition.base, done.scenario.tuning, done.scenario.structure
+    names = {"cv": structure.cv_names, "mv": structure.mv_names}
+    out: dict[str, Any] = {}
+    for key, field in done.definition.fields.items():
+        section, _, rest = key.partition(".")
+        name, _, channel = rest.partition(".")
+        if section == "tuning" and field.kind == "number":
+            of = TUNING[name].of
+            values = np.asarray(getattr(tuning, name))
+            out[key] = float(values[names[of].index(channel)] if of else values)
+        elif key in base:
+            out[key] = base[key]
+        elif key in ("prediction_horizon", "control_horizon", "first_penalised", "blocks"):
+            out[key] = getattr(structure, key)
         else:
-            unit = field.metadata["unit"].replace("%", "%%")
-            given = "" if field.default is not None else ", the preset's if not given"
-            parser.add_argument(option, type=float, default=field.default, help=f"[{unit}]{given}")
-    options = vars(parser.parse_args(arguments))
+            out[key] = field.default
+    for key in ("disturbance", "sensor_fault"):
+        out[key] = base.get(key, ())
+    return out
+
+
+def tuning_of(explored: Explorer, preset: str) -> Tuning:
+    """A preset as the sliders start with it."""
+    return explored.process.tuning(explored.process.structure(), preset)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run once and print the key figures; any key of a study is an argument ``KEY=VALUE``."""
+    parser = argparse.ArgumentParser(
+        prog="explore", description="Close one loop and print its key figures.", allow_abbrev=False
+    )
+    parser.add_argument("--process", default=DEFAULT_PROCESS, help="a process file, or a shipped process")
+    parser.add_argument(
+        "settings",
+        nargs="*",
+        metavar="KEY=VALUE",
+        help="any key of docs/studies.md, such as controller=continuous",
+    )
+    options = parser.parse_args(arguments)
     try:
-        done = run(Settings(**options))
+        explored = explorer(options.process)
+        given = {}
+        for setting in options.settings:
+            key, _, text = setting.partition("=")
+            given[key] = find(explored.fields, key, key).parse(key, text)
+        done = run(explored, nested(given))
     except InputError as error:
         parser.error(str(error))
-    for words, unit, value in shown_figures(done):
-        number, shown = written(value, unit)
-        print(f"{words:28} {number:>12} {shown}")
-    print(f"{'this run, compilation included':28} {done.seconds:>10.3g} s")
+    for key, words, unit in shown_figures(explored.process):
+        number, shown = written(done.kpis[key], unit)
+        print(f"{words:40} {number:>12} {shown}")
+    print(f"{'this run, compilation included':40} {done.seconds:>10.3g} s")

@@ -1,5 +1,6 @@
 """The command line: exit status, what is printed and written, and that bad input leaves no trace."""
 
+import contextlib
 import json
 import subprocess
 import sys
@@ -230,7 +231,7 @@ def test_unknown_commands_and_options_are_bad_input(arguments, unsolved, capsys)
         ([], ["plan", "fmu", "identify", "study", "bench"]),
         (["plan"], ["--out", "standard output", "--finish", "default: auto", "3 infeasible"]),
         (["fmu", "build"], ["--fmi", "default: 2"]),
-        (["identify"], ["[%]", "[m3/h]", "default: 7500.0", "default: 250", "10 s"]),
+        (["identify"], ["MV=VALUE", "default: the first", "[samples]", "default: model.json"]),
         (["study", "run", "thesis"], ["default: results", "--quick", "default: that of the study"]),
         (["bench"], ["--quick", "default: all", "default: nowhere", "[ms]", "jaxmpc[bench]", "Ctrl-C"]),
     ],
@@ -276,7 +277,9 @@ def test_a_plant_that_fails_ends_with_one_line_and_status_one(stub, tmp_path, ca
     def crash(*_):
         raise PlantError("well.fmu: the FMU ended its process with signal SIGABRT during doStep at t = 10 s")
 
-    stub("identify.step_test", identify_step_response=crash, settling_notes=list)
+    stub(
+        "identify.plants", closing=contextlib.nullcontext, identified=crash, open_plant=lambda *_, **__: None
+    )
     assert main(["identify", "--plant", "jax", "--out", str(tmp_path / "model.json")]) == 1
     assert capsys.readouterr().err == (
         "jaxmpc: well.fmu: the FMU ended its process with signal SIGABRT during doStep at t = 10 s\n"
@@ -294,7 +297,7 @@ def test_fmu_build_prints_where_the_fmu_is(stub, tmp_path, capsys):
 
 def test_identify_writes_a_model_that_says_where_it_comes_from(tmp_path, capsys):
     out = tmp_path / "model.json"
-    options = ["--plant", "jax", "--choke", "40", "--lift", "7000", "--steps", "2", "50", "--samples", "20"]
+    options = ["--at", "choke=40", "--at", "gas_lift=7000", "--step", "gas_lift=50", "--samples", "20"]
     assert main(["identify", *options, "--out", str(out)]) == 0
     model = json.loads(out.read_text())
     assert (model["working_point"]["choke"], model["working_point"]["gas_lift"]) == (40.0, 7000.0)

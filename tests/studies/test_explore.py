@@ -1,46 +1,92 @@
 """The interactive app: what it computes, what it draws, how it is started, and a browser that drives it."""
 
 import contextlib
+import csv
 import html
 import http.client
 import importlib.util
+import io
 import json
 import os
+import re
 import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import jax
 import numpy as np
 import pytest
-from studies.definition.presets import CHOKE
 
+from figures import choose
 from figures import explore as draw
+from jaxmpc import Structure, make_tuning
 from jaxmpc.cli import main as cli
 from jaxmpc.errors import InputError, MissingToolError
-from studies.notebooks import launch
-from studies.notebooks import loop as explore
-from studies.notebooks.loop import RUN, Settings, main, run, shown_figures, written
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.process.new import new_process
+from studies.definition.sweep import StudyDefinition
+from studies.load import expand
+from studies.notebooks import controls, export, launch
+from studies.notebooks.loop import RUN, explorer, main, nested, run, shown_figures, written
 from studies.plans import plan_at
+from studies.rerun import close_loop
 from tests import studies_synthetic
 from tests.sweep_synthetic import DEADZONE, OIL_DEADZONE, WEIGHT, grid, numbers, runs, write
 
-PNG = b"\x89PNG"
+SHAPE = {"prediction_horizon": 40, "blocks": [1, 1, 2, 4, 8]}  # small, to compile quickly
+
+
+def rising(gain, delay, time):
+    """Step response of first order with dead time, 60 samples."""
+    k = np.arange(1, 61)
+    return np.where(k > delay, gain * (1 - np.exp(-(k - delay) / time)), 0.0)
 
 
 @pytest.fixture(scope="module")
-def continuous():
-    return run(Settings(controller="continuous"))
+def column(tmp_path_factory):
+    """A process file that is no well: its model is its plant, and it has a measured disturbance."""
+    folder = tmp_path_factory.mktemp("column")
+    model = StepResponseModel(
+        np.array([[rising(0.8, 2, 8), rising(-0.3, 5, 12)], [rising(0.2, 3, 15), rising(1.5, 1, 6)]]),
+        5.0,
+        cv_names=("level", "temperature"),
+        mv_names=("feed", "steam"),
+        cv_units=("m", "degC"),
+        mv_units=("t/h", "t/h"),
+        dv_names=("ambient",),
+        dv_units=("degC",),
+        dv_coefficients=np.array([[rising(0.5, 4, 10)], [rising(-0.2, 2, 10)]]),
+    )
+    model.save(folder / "column.json")
+    text, _ = new_process(model, "column.json", "column", steps={"feed": 0.5})
+    (folder / "column.toml").write_text(text)
+    return folder / "column.toml"
 
 
 @pytest.fixture(scope="module")
-def mixed():
-    return run(Settings())
+def explored(column):
+    return explorer(column)
+
+
+@pytest.fixture(scope="module")
+def well():
+    return explorer()
+
+
+@pytest.fixture(scope="module")
+def continuous(explored):
+    return run(explored, SHAPE | {"controller": "continuous"})
+
+
+@pytest.fixture(scope="module")
+def mixed(explored):
+    return run(explored, SHAPE)
 
 
 @pytest.fixture(scope="module")
@@ -55,110 +101,128 @@ def sweep(tmp_path_factory):
 # ------------------------------------------------------------------------------------------------- settings
 
 
-def test_what_is_not_set_comes_from_the_preset():
-    light, changed = Settings(preset="thesis-light"), Settings(preset="thesis-light", oil_deadzone=2.0)
-    assert light.tuning.move_weight.tolist() == [62.5, 0.2]
-    assert light.tuning.deadzone.tolist() == [1000.0, 5.0]
-    assert changed.tuning.deadzone.tolist() == [1000.0, 2.0]
-    assert changed.tuning.move_weight.tolist() == [62.5, 0.2]
+@pytest.mark.parametrize("process", ["explored", "well"])
+def test_controls_that_are_not_touched_say_what_the_preset_says(process, request):
+    explored = request.getfixturevalue(process)
+    base, preset = controls.first_base(explored), explored.process.tuning(explored.process.structure())
+    for field, names in (("deadzone", explored.process.cv_names), ("move_weight", explored.process.mv_names)):
+        assert list(base["tuning"][field].values()) == getattr(preset, field).tolist()
+        assert list(base["tuning"][field]) == list(names)
+    assert base["reference"] == explored.short_step()
+    assert (base["controller"], base["actuator"]) == ("mixed-integer", "step")
 
 
-def test_without_soft_mpc_the_deviation_weighs_as_much_as_far_outside_the_deadzone():
-    tuning = Settings(soft=False, oil_weight=0.3).tuning
-    np.testing.assert_allclose(tuning.cv_weight, [2e-4, 0.4])
-    assert not np.any(tuning.soft_quadratic)
-    assert not np.any(tuning.soft_linear)
-    preset = Settings(preset="no-soft").tuning
-    np.testing.assert_allclose(Settings(soft=False).tuning.cv_weight, preset.cv_weight)
+def test_a_slider_can_stand_where_its_preset_is(explored, well):
+    for one in (explored, well):
+        found = [controls.scenario_sliders(one)]
+        found += [controls.tuning_sliders(one, preset) for preset in one.process.presets]
+        for sliders in found:
+            for key, slider in sliders.items():
+                assert slider.value in slider.steps, key
+                assert slider.steps == sorted(slider.steps)
 
 
-def test_presets_are_not_changed_by_settings():
-    Settings(choke_weight=1.0, gas_deadzone=0.0, soft=False).tuning  # noqa: B018
-    assert Settings().tuning.move_weight[0] == 250.0
+def test_every_key_of_studies_has_a_control(explored, well):
+    for one in (explored, well):
+        own = {*controls.first_base(one), *controls.tuning_sliders(one, one.process.default_preset)}
+        own |= {*controls.scenario_sliders(one), *(row["key"] for row in controls.further_fields(one))}
+        left = {key for key in one.fields if key not in own and not key.startswith("sensor_fault.")}
+        assert left <= {"disturbance.offset"}  # one slider per disturbance in its place
 
 
-def test_only_the_mixed_integer_controller_moves_whole_steps():
-    steps = {name: Settings(controller=name).structure.integer_step[0] for name in explore.CONTROLLERS}
-    assert steps == {"continuous": None, "rounded": None, "mixed-integer": 2.0}
+def test_a_further_setting_is_read_checked_and_named(explored):
+    chosen, soft, tuning, scenario = start(explored)
+    further = {"seed": "3", "blocks": "1 1 2", "tuning.cv_high.level": "inf", "noise.level": ""}
+    base = controls.base_of(explored, chosen, soft, tuning, scenario, further)
+    assert (base["seed"], base["blocks"], base["tuning"]["cv_high"]) == (3, (1, 1, 2), {"level": np.inf})
+    assert "noise" not in base
+    with pytest.raises(InputError, match=r"base\.seed") as refused:
+        controls.base_of(explored, chosen, soft, tuning, scenario, {"seed": "many"})
+    assert "whole number" in str(refused.value)
 
 
-def test_the_disturbance_starts_at_its_time():
-    offsets = Settings(pressure=-2.0, pressure_time=600.0).offsets
-    assert len(offsets) == 180
-    assert offsets[59:61].tolist() == [0.0, -2.0]
+def start(explored):
+    """What the controls say at first: choices, Soft MPC, tuning and scenario."""
+    chosen = {name: next(iter(options.values())) for name, options in controls.choices(explored).items()}
+    sliders = controls.tuning_sliders(explored, chosen["preset"]), controls.scenario_sliders(explored)
+    return chosen, True, *({key: slider.value for key, slider in some.items()} for some in sliders)
 
 
-def test_the_whole_run_has_the_reference_of_the_thesis():
-    assert Settings(whole=True).reference.samples(10.0) == 7800
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("controller", "fuzzy"),
-        ("preset", "none"),
-        ("blocking", "some"),
-        ("blocking", "none"),  # whole moves without blocks take seconds each
-        ("pressure", np.nan),
-        ("pressure_time", np.inf),
-    ],
-)
-def test_settings_that_do_not_exist_are_refused_by_name(field, value):
-    with pytest.raises(InputError) as refused:
-        Settings(**{field: value})
-    assert refused.value.field == field
+def test_each_disturbance_starts_at_its_time(explored):
+    chosen, soft, tuning, scenario = start(explored)
+    scenario |= {"disturbance.ambient": -2.0, "disturbance.output.level": 1.0, "disturbance.time": 300.0}
+    base = controls.base_of(explored, chosen, soft, tuning, scenario, {})
+    done = run(explored, base | SHAPE)
+    offsets = done.scenario.disturbance
+    assert offsets.shape == (180, 3)
+    assert offsets[59:61].tolist() == [[0.0, 0.0, 0.0], [-2.0, 1.0, 0.0]]
+    assert done.trajectory.cv[61, 0] - done.trajectory.cv[60, 0] > 0.8  # added to the CV
 
 
 @pytest.mark.parametrize(
     ("changes", "field"),
     [
-        ({"choke_weight": -1.0}, "tuning.move_weight"),
-        ({"model_choke": 150.0}, "model.choke"),
-        ({"oil_setpoint": np.nan}, "reference.setpoints"),
+        ({"controller": "fuzzy"}, "base.controller"),
+        (
+            {"blocking": "none", "control_horizon": 200},
+            "base.blocking",
+        ),  # whole moves without blocks take seconds
+        ({"tuning.move_weight.feed": -1.0}, "base.tuning.move_weight.feed"),
+        ({"tuning.move_weight.choke": 1.0}, "base.tuning.move_weight.choke"),
+        ({"duration": float("nan")}, "base.duration"),
     ],
 )
-def test_numbers_that_no_controller_has_are_refused_before_anything_runs(changes, field):
-    with pytest.raises(InputError, match=field):
-        run(Settings(**changes))
+def test_what_no_controller_has_is_refused_by_key_before_anything_runs(changes, field, explored):
+    with pytest.raises(InputError) as refused:
+        run(explored, nested(changes))
+    assert refused.value.field == field
 
 
 # ------------------------------------------------------------------------------------------------------ runs
 
 
-def test_a_run_follows_its_setpoints_with_whole_choke_moves(mixed):
+def test_a_run_follows_its_setpoints_with_whole_moves(mixed, explored):
     t = mixed.trajectory
+    before, after = explored.process.reference().setpoints[:2]
     assert t.samples == 180
-    assert t.setpoint[29].tolist() == [11013.0, 185.0]
-    assert t.setpoint[30].tolist() == [9640.0, 152.0]
-    np.testing.assert_allclose(t.move[:, 0] / 2, np.round(t.move[:, 0] / 2), atol=1e-9)
-    assert abs(t.cv[-1, 0] - 9640.0) < 1000.0
+    np.testing.assert_array_equal(t.setpoint[[29, 30]], [before, after])
+    np.testing.assert_allclose(t.move[:, 0] / 0.5, np.round(t.move[:, 0] / 0.5), atol=1e-9)
+    assert abs(t.cv[-1, 0] - after[0]) < explored.process.cvs[0].span / 10
 
 
 def test_the_key_figures_are_those_of_the_run(mixed):
     t = mixed.trajectory
-    choke = np.diff(t.mv[:, 0], prepend=50.0)
+    moves = np.diff(t.mv[:, 0], prepend=t.mv_demand[0, 0] - t.move[0, 0])
+    assert mixed.kpis["travel.feed"] == pytest.approx(np.abs(moves).sum())
     deviation = np.abs(t.cv - t.setpoint).mean(axis=0)
-    assert mixed.kpis["choke_travel"] == pytest.approx(np.abs(choke).sum())
-    assert mixed.kpis["mean_absolute_deviation.gas_rate"] == pytest.approx(deviation[0])
-    assert mixed.kpis["mean_absolute_deviation.oil_rate"] == pytest.approx(deviation[1])
-    rows = shown_figures(mixed)
-    assert len(rows) == len(explore.SHOWN)
-    assert ("choke travel", "%", mixed.kpis["choke_travel"]) in rows
+    for name, value in zip(("level", "temperature"), deviation, strict=True):
+        assert mixed.kpis[f"mean_absolute_deviation.{name}"] == pytest.approx(value)
+    shown = {key: (words, unit) for key, words, unit in shown_figures(mixed.definition.process)}
+    assert shown["travel.feed"] == ("feed, travel", "t/h")
+    assert "reversals.steam" not in shown  # it takes every value
 
 
 @pytest.mark.parametrize("name", ["continuous", "mixed"])
 def test_the_first_planned_move_is_the_one_that_was_made(name, request):
     done = request.getfixturevalue(name)
     for sample in (0, 30, 179):
-        plan = plan_at(done.data, RUN, 10.0 * sample)
+        plan = plan_at(done.data, RUN, 5.0 * sample)
         np.testing.assert_allclose(plan.move[0], done.trajectory.move[sample], atol=1e-6)
         np.testing.assert_allclose(plan.mv[0], done.trajectory.mv_demand[sample], atol=1e-6)
-        assert plan.cv.shape == (250, 2)
+        assert plan.cv.shape == (40, 2)
 
 
-@pytest.mark.parametrize("name", ["continuous", "mixed"])
-def test_other_numbers_compile_nothing_again(name, request):
-    controller = request.getfixturevalue(name).settings.controller
+def test_plans_of_blocks_of_their_own_are_expanded_for_each_mv(explored):
+    blocks = [[1, 1, 2, 12], [4, 4, 8]]
+    done = run(explored, {"controller": "continuous", "prediction_horizon": 40, "blocks": blocks})
+    plan, made = plan_at(done.data, RUN, 150.0), np.asarray(done.trajectory.plan)[30]
+    np.testing.assert_allclose(plan.move[:, 0], np.repeat(made[:4, 0], blocks[0]))
+    np.testing.assert_allclose(plan.move[:, 1], np.repeat(made[:3, 1], blocks[1]))
+
+
+@pytest.mark.parametrize("kind", ["continuous", "mixed-integer"])
+@pytest.mark.usefixtures("continuous", "mixed")
+def test_other_numbers_compile_nothing_again(kind, explored):
     compiled = []
 
     def heard(event, duration, **_):
@@ -166,22 +230,18 @@ def test_other_numbers_compile_nothing_again(name, request):
             compiled.append(event)
 
     jax.monitoring.register_event_duration_secs_listener(heard)
-    run(Settings(controller, choke_weight=100.0, oil_deadzone=1.0, oil_weight=0.2, soft=False, pressure=-1.0))
-    run(Settings(controller, preset="no-soft-plain", oil_setpoint=140.0))
+    changed = nested({"tuning.move_weight.feed": 3.0, "tuning.deadzone.level": 0.1, "soft": False})
+    run(explored, SHAPE | {"controller": kind} | changed)
+    run(explored, SHAPE | {"controller": kind, "reference": explored.short_step([1.0, 1.0])})
     assert compiled == []
     jax.jit(lambda x: x + len(compiled))(1.0)  # the ear is not deaf
     assert compiled
 
 
-def test_progress_ends_with_all_samples():
+def test_progress_ends_with_all_samples(explored):
     seen = []
-    run(Settings(controller="continuous"), lambda done, total: seen.append((done, total)))
+    run(explored, SHAPE | {"controller": "continuous"}, lambda done, total: seen.append((done, total)))
     assert seen[-1] == (180, 180)
-
-
-def test_a_pressure_drop_costs_oil(continuous):
-    dropped = run(Settings(controller="continuous", pressure=-4.0, pressure_time=0.0))
-    assert dropped.kpis["oil_produced"] < continuous.kpis["oil_produced"]
 
 
 def test_short_times_are_written_in_milliseconds_and_large_numbers_in_full():
@@ -189,89 +249,157 @@ def test_short_times_are_written_in_milliseconds_and_large_numbers_in_full():
     assert written(1450.0, "s") == ("1,450", "s")
     assert written(123456.7, "m3") == ("123,457", "m³")
     assert written(3.0, "1") == ("3", "")
+    assert written(float("nan"), "1") == ("nan", "")
 
 
-def test_the_script_prints_every_key_figure(capsys):
-    main(["--controller", "continuous", "--choke-weight", "100", "--no-soft"])
+def test_the_script_prints_every_key_figure(column, capsys):
+    main(["--process", str(column), "controller=continuous", "prediction_horizon=40", "blocks=1 1 2 4 8"])
     printed = capsys.readouterr().out
-    for words in explore.SHOWN.values():
+    for _, words, _ in shown_figures(explorer(column).process):
         assert words in printed
 
 
-def test_the_script_explains_itself_and_refuses_bad_input(capsys):
-    with pytest.raises(SystemExit) as left:
-        main(["--help"])
-    assert left.value.code == 0
-    assert "[1/%^2]" in capsys.readouterr().out
-    with pytest.raises(SystemExit) as left:
-        main(["--choke-weight", "-1"])
-    assert left.value.code == 2
-    assert "move_weight" in capsys.readouterr().err
+def test_the_script_refuses_bad_input(column, capsys):
+    for setting in ("tuning.move_weight.feed=-1", "tuning.moveweight.feed=1"):
+        with pytest.raises(SystemExit) as left:
+            main(["--process", str(column), setting])
+        assert left.value.code == 2
+        assert "tuning.move_weight.feed" in capsys.readouterr().err
+
+
+# --------------------------------------------------------------------------------------- pins, differences, export
+
+
+def test_pins_have_names_and_colours_of_their_own(mixed, continuous):
+    pins = controls.pinned(controls.pinned((), "A", mixed), "", continuous)
+    runs, colours = controls.named(mixed, pins)
+    assert list(runs) == ["now", "A", "B"]
+    assert len(set(colours)) == 3
+    left = controls.unpinned(pins, "A")
+    again = controls.pinned(left, "B", mixed)  # in place of the one of that name
+    assert [pin.run for pin in again] == [mixed]
+
+
+def test_what_differs_between_runs_is_told_by_key_with_units(explored, mixed, continuous):
+    changed = run(explored, SHAPE | {"controller": "continuous", "tuning": {"deadzone": {"level": 0.25}}})
+    (row,) = export.differences([continuous, changed])
+    own = mixed.scenario.tuning.deadzone[0]
+    assert row == ["deadzone of the level", "tuning.deadzone.level", f"{own:g}", "0.25", "m"]
+    assert [row[1:] for row in export.differences([continuous, mixed])] == [
+        ["controller", "continuous", "mixed-integer", ""]
+    ]
+    assert export.differences([mixed, mixed]) == []
+
+
+def test_an_exported_run_is_a_study_that_repeats_it(explored, tmp_path):
+    steps = [{"time": 300.0, "offset": 1.5, "name": "output.level"}]
+    more = {"controller": "continuous", "noise": {"level": 0.1}, "disturbance": steps, "soft": False}
+    done = run(explored, SHAPE | more | nested({"tuning.mv_high.steam": float("inf")}))
+    body = tomllib.loads(export.as_toml(done, "mine"))
+    study = expand(StudyDefinition.from_dict(body))
+    assert (study.name, study.count) == ("mine", 1)
+    again = close_loop(study, study.scenario(0))
+    np.testing.assert_array_equal(again.cv, done.trajectory.cv)
+
+
+def test_exported_python_makes_the_same_tuning(mixed):
+    made = {}
+    exec(export.as_python(mixed), made)
+    assert made["structure"] == mixed.scenario.structure
+    assert isinstance(made["structure"], Structure)
+    assert made["make_tuning"] is make_tuning
+    for ours, theirs in zip(
+        jax.tree.leaves(mixed.scenario.tuning), jax.tree.leaves(made["tuning"]), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("vl_convert") is None, reason="not installed: vl-convert")
+def test_a_page_to_send_loads_nothing_from_elsewhere(mixed, continuous):
+    page = export.as_page({"now": mixed, "<b>": continuous}, draw.COLOURS[:2])
+    assert "<b>: " not in page
+    assert not re.search(r"""(src|href)=["'](https?:)?//""", page)
+    assert "import(" not in page.replace("import(\n", "")
+    assert "prediction_horizon = 40" in page
+    assert "mixed-integer" in page
 
 
 # --------------------------------------------------------------------------------------------------- figures
 
 
-def test_a_run_is_drawn_beside_the_pinned_one(mixed, continuous):
-    alone = draw.tracking(mixed.data)
-    both = draw.tracking(mixed.data, pinned=continuous.data)
-    assert [ax.get_ylabel() for ax in alone.axes] == [
-        "oil rate [m³/h]",
-        "gas rate [m³/h]",
-        "choke [%]",
-        "gas lift [m³/h]",
+def rows_of(chart):
+    """The rows of the first data of a chart."""
+    data = chart["data"] if "data" in chart else chart["vconcat"][0]["hconcat"][0]["data"]
+    return list(csv.DictReader(io.StringIO(data["values"])))
+
+
+def test_runs_share_a_time_axis_and_its_zoom(mixed, continuous):
+    shown = [
+        draw.Shown("now", draw.COLOURS[0], mixed.data),
+        draw.Shown("A", draw.COLOURS[1], continuous.data),
     ]
-    oil = [line for line in both.axes[0].lines if line.get_label() == "pinned"]
-    np.testing.assert_allclose(oil[0].get_ydata()[:180], continuous.trajectory.cv[:, 1])
-    assert len(both.axes[0].lines) == len(alone.axes[0].lines) + 1
-    assert draw.png(both).startswith(PNG)
-    assert 'alt="a &quot;run&quot;"' in draw.image(alone, 'a "run"')
+    spec = draw.tracking(shown, zoom=(2.0, 5.0))
+    titles = [panel["title"]["text"] for panel in spec["vconcat"][:-1]]
+    assert titles == ["level [m]", "temperature [degC]", "feed [t/h]", "steam [t/h]"]
+    (brush,) = spec["vconcat"][-1]["params"]
+    assert brush["name"] == draw.ZOOM
+    assert brush["value"] == {"x": [2.0, 5.0]}
+    for panel in spec["vconcat"][:-1]:
+        for layer in panel["layer"]:
+            assert layer["encoding"]["x"]["scale"]["domain"] == {"param": draw.ZOOM}
+    rows = rows_of(draw.tracking(shown))
+    of = {name: [row for row in rows if row["run"] == name] for name in ("now", "A")}
+    assert len(of["now"]) == len(of["A"]) == 181  # the end of the last sample, too
+    np.testing.assert_allclose(
+        [float(row["c1"]) for row in of["A"][:-1]], continuous.trajectory.cv[:, 1], rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        [float(row["d0"]) for row in of["now"][:-1]], mixed.trajectory.mv_demand[:, 0], rtol=1e-6
+    )
 
 
 def test_the_plan_of_a_time_is_drawn_from_that_time_on(mixed):
-    figure = draw.planned(mixed.data, 600.0)
-    (plan,) = [line for line in figure.axes[0].lines if line.get_label() == "plan"]
-    expected = plan_at(mixed.data, RUN, 600.0)
-    np.testing.assert_allclose(plan.get_xdata() * 60, expected.cv_time)
-    np.testing.assert_allclose(plan.get_ydata(), expected.cv[:, 1])
-    assert draw.png(draw.planned(mixed.data, 0.0)).startswith(PNG)
-    assert draw.png(draw.planned(mixed.data, 1790.0)).startswith(PNG)
+    rows = [row for row in rows_of(draw.planned(mixed.data, 300.0)) if row["what"] == "plan"]
+    expected = plan_at(mixed.data, RUN, 300.0)
+    np.testing.assert_allclose([60 * float(row["t"]) for row in rows], expected.cv_time, rtol=1e-5)
+    np.testing.assert_allclose([float(row["y"]) for row in rows], expected.cv[:, 0], rtol=1e-5, atol=1e-6)
+    for at in (0.0, 895.0):
+        assert draw.planned(mixed.data, at)["vconcat"]
 
 
 def test_the_runs_of_a_sweep_become_points_with_what_varies_and_the_front(sweep):
-    table = draw.points(sweep)
+    table = choose.points(sweep)
     expected = numbers(4)
-    np.testing.assert_allclose(table[draw.X], expected["choke_travel"])
+    np.testing.assert_allclose(table[choose.X], expected["travel"][:, 0])
     zones = (1000.0, 5.0)
-    np.testing.assert_allclose(table[draw.Y], (expected["mean_absolute_deviation"] / zones).mean(axis=1))
+    np.testing.assert_allclose(table[choose.Y], (expected["mean_absolute_deviation"] / zones).mean(axis=1))
     assert table["number"].tolist() == [0, 1, 2, 3]
-    assert table["best"][int(np.argmin(table[draw.X]))] == "on the front"
+    assert table["best"][int(np.argmin(table[choose.X]))] == "on the front"
     assert all("250" in text for text in table["run"][1::2])
 
 
 def test_a_stored_scenario_is_drawn_as_it_is_stored(sweep):
-    data = draw.stored(sweep, 2)
+    data = choose.stored(sweep, 2)
     np.testing.assert_allclose(data.measurement.values[0], runs(4)["measurement"][2])
     assert data.tuning_deadzone.values.tolist() == [[1000.0, 5.0]]
     assert (data.kind.item(), data.actuator.item()) == ("continuous", "step")
-    assert draw.png(draw.tracking(data, wide=True)).startswith(PNG)
+    assert draw.tracking([draw.Shown("2", draw.COLOURS[0], data)])["vconcat"]
     with pytest.raises(InputError, match="number"):
-        draw.stored(sweep, 4)
+        choose.stored(sweep, 4)
 
 
 def test_the_controllers_of_a_comparison_become_points_too(tmp_path):
     studies_synthetic.stored(tmp_path)
-    table = draw.points(tmp_path)
+    table = choose.points(tmp_path)
     assert len(table) == 3
-    data = draw.stored(tmp_path, 1)
+    data = choose.stored(tmp_path, 1)
     assert data.controller.values.tolist() == [RUN]
-    assert list(data.mv.values).index(CHOKE) == 0
-    assert draw.png(draw.tracking(data)).startswith(PNG)
+    assert draw.tracking([draw.Shown("1", draw.COLOURS[0], data)])["vconcat"]
 
 
 def test_the_points_can_be_picked_from_a_chart(sweep):
     pytest.importorskip("altair")
-    spec = draw.scatter(draw.points(sweep)).to_dict()
+    spec = choose.scatter(choose.points(sweep)).to_dict()
     assert spec["encoding"]["x"]["title"] == "choke travel [%]"
     assert {"number", "travel", "deviation", "best"} <= set(next(iter(spec["datasets"].values()))[0])
 
@@ -279,7 +407,7 @@ def test_the_points_can_be_picked_from_a_chart(sweep):
 def test_what_is_no_store_is_refused(tmp_path):
     for path in (tmp_path / "none.zarr", tmp_path):
         with pytest.raises(InputError):
-            draw.points(path)
+            choose.points(path)
 
 
 # --------------------------------------------------------------------------------------------------- starting
@@ -287,7 +415,9 @@ def test_what_is_no_store_is_refused(tmp_path):
 
 def test_a_port_or_store_that_does_not_exist_is_refused(tmp_path):
     with pytest.raises(InputError, match="port"):
-        launch.explore(0)
+        launch.explore(port=0)
+    with pytest.raises(InputError, match="process"):
+        launch.explore(tmp_path / "none.toml")
     with pytest.raises(InputError, match="store"):
         launch.explore(store=tmp_path / "none.zarr")
 
@@ -636,6 +766,12 @@ return [...(chart?.shadowRoot?.querySelectorAll('.mark-symbol.role-mark path') |
 """
 
 
+CHARTS = """
+return [...document.querySelectorAll('marimo-vega')].map(e => e.shadowRoot?.querySelector('svg.marks'))
+  .filter(e => e).map(e => e.textContent + [...e.querySelectorAll('path')].map(p => p.getAttribute('d')).join())
+"""
+
+
 class Page:
     """The app in a browser without a window."""
 
@@ -645,10 +781,14 @@ class Page:
     def figures(self):
         return self.script("return (document.querySelector('#key-figures') || {}).innerText || ''")
 
-    def image(self, name):
-        return self.script(
-            "return (document.querySelector(`img[alt='${arguments[0]}']`) || {}).src || ''", name
-        )
+    def differences(self):
+        return self.script("return (document.querySelector('#differences') || {}).innerText || ''")
+
+    def charts(self):
+        return self.script(CHARTS)
+
+    def complaints(self):
+        return "\n".join(e["message"] for e in self.driver.get_log("browser") if e["level"] == "SEVERE")
 
     def move_slider(self, label, key):
         thumb = self.script(
@@ -664,8 +804,9 @@ class Page:
         return until(lambda: self.script(FIND, f"marimo-{kind}", label))
 
 
-@pytest.fixture
-def page(address):
+@contextlib.contextmanager
+def opened(address):
+    """A page in a browser without a window."""
     from selenium import webdriver
 
     options = webdriver.ChromeOptions()
@@ -675,46 +816,60 @@ def page(address):
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     driver = webdriver.Chrome(options, webdriver.ChromeService(shutil.which("chromedriver")))
     try:
-        driver.get(address.geturl())
+        driver.get(address)
         yield Page(driver)
     finally:
         driver.quit()
 
 
-@pytest.mark.skipif(bool(_missing()), reason=f"not installed: {_missing()}")
-def test_in_a_browser_a_slider_changes_figure_and_key_figures_and_a_point_shows_its_run(page, tmp_path):
-    from selenium.webdriver.common.action_chains import ActionChains
+BROWSER = pytest.mark.skipif(bool(_missing()), reason=f"not installed: {_missing()}")
+
+
+@BROWSER
+def test_in_a_browser_a_slider_changes_charts_and_key_figures_beside_a_pinned_run(column, tmp_path):
     from selenium.webdriver.common.keys import Keys
 
-    until(lambda: page.figures() and page.image("the run") and page.image("the plan"))
-    before, drawn, planned = page.figures(), page.image("the run"), page.image("the plan")
-    page.press("Pin this run")
-    until(lambda: "pinned" in page.figures())
-    until(lambda: page.image("the run") != drawn)
-    pinned, drawn = page.figures(), page.image("the run")
-    page.move_slider("oil deadzone", Keys.HOME)
-    until(lambda: page.figures() != pinned and page.image("the run") != drawn)
-    until(lambda: page.image("the plan") != planned)
-    travel = before.splitlines()[1].split("\t")[1]
-    assert page.figures().splitlines()[1].split("\t")[2] == travel  # the pinned run stays
-    planned, run_before = page.image("the plan"), page.image("the run")
-    page.move_slider("plan made at", Keys.ARROW_RIGHT)
-    until(lambda: page.image("the plan") != planned)
-    assert page.image("the run") == run_before
-    page.driver.save_screenshot(str(tmp_path / "run.png"))
+    with serving(tmp_path / "log", column, "--headless") as (_, found), opened(found) as page:
+        until(lambda: page.figures() and len(page.charts()) == 2)
+        before, (run_before, plan_before) = page.figures(), page.charts()
+        page.press("Pin this run")
+        until(lambda: "what differs" not in page.differences() and "Nothing differs" in page.differences())
+        page.move_slider("level, deadzone", Keys.END)
+        until(lambda: "tuning.deadzone.level" in page.differences())
+        until(
+            lambda: (
+                len(page.charts()) == 2 and page.charts()[0] != run_before and page.charts()[1] != plan_before
+            )
+        )
+        travel = before.splitlines()[1].split("\t")[1]
+        assert page.figures().splitlines()[0].split() == ["now", "A"]
+        assert page.figures().splitlines()[1].split("\t")[2] == travel  # the pinned run stays
+        run_before, plan_before = page.charts()
+        page.move_slider("plan made at", Keys.ARROW_RIGHT)
+        until(lambda: len(page.charts()) == 2 and page.charts()[1] != plan_before)
+        assert page.charts()[0] == run_before
+        page.driver.save_screenshot(str(tmp_path / "run.png"))
+        assert page.complaints() == ""
+    assert (tmp_path / "log").read_text() == ""
 
-    page.script(SECOND_PAGE)
-    at = until(lambda: page.script(POINTS))
-    assert len(at) == 4
-    ActionChains(page.driver).move_by_offset(*map(int, at[0])).click().perform()
-    until(lambda: page.image("the picked run"))
-    page.driver.save_screenshot(str(tmp_path / "study.png"))
-    wrong = [entry["message"] for entry in page.driver.get_log("browser") if entry["level"] == "SEVERE"]
-    assert "\n".join(wrong) == ""
+
+@BROWSER
+def test_in_a_browser_a_point_of_a_study_shows_its_run(address, tmp_path):
+    from selenium.webdriver.common.action_chains import ActionChains
+
+    with opened(address.geturl()) as page:
+        until(page.figures)
+        page.script(SECOND_PAGE)
+        at = until(lambda: page.script(POINTS))
+        assert len(at) == 4
+        ActionChains(page.driver).move_by_offset(*map(int, at[0])).click().perform()
+        until(lambda: "choke [%]" in "".join(page.charts()))
+        page.driver.save_screenshot(str(tmp_path / "study.png"))
+        assert page.complaints() == ""
 
 
 @pytest.mark.skipif(importlib.util.find_spec("marimo") is None, reason="not installed: marimo")
 def test_the_app_is_a_script_too():
     words = [sys.executable, "-m", "studies.notebooks.explore", "--help"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=True)
-    assert "--oil-deadzone" in done.stdout
+    assert "KEY=VALUE" in done.stdout

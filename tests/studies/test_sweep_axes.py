@@ -211,6 +211,13 @@ def test_a_column_that_is_not_there_is_refused_with_a_near_match(table):
 
 
 GOOD = {"key": WEIGHT, "values": [1]}
+
+
+def test_without_axes_the_base_is_the_one_scenario():
+    study = expand(StudyDefinition.from_dict({"study": {"name": "alone"}, "base": {"seed": 7}}))
+    assert (study.count, study.columns, study.scenario(0).seed) == (1, (), 7)
+
+
 BAD_AXES = {
     "a misspelt key": ([{"key": "tuning.deadzone.gas_rat", "values": [1]}], "axes[0].key", DEADZONE),
     "a key without its section": ([{"key": "deadzone.gas_rate", "values": [1]}], "axes[0].key", DEADZONE),
@@ -276,7 +283,6 @@ BAD_AXES = {
     ),
     "a distribution in a grid": ([uniform(WEIGHT)], "axes[0].distribution", "latin-hypercube or sobol"),
     "a position beyond the end": ([{**GOOD, "keep": [1]}], "axes[0].keep[0]", "from 0 to 0"),
-    "no axes": ([], "axes", "one axis or more"),
 }
 
 
@@ -288,6 +294,7 @@ def test_a_bad_axis_is_refused_with_its_path(axes, field, said):
 
 
 BAD_DRAWS = {
+    "no axes to zip": ({"method": "zip"}, None, "axes", "one axis or more"),
     "no count": ({"method": "sobol"}, uniform(WEIGHT), "sampling.count", "number of draws"),
     "a count of a grid": ({"count": 3}, GOOD, "sampling.count", "sobol"),
     "nothing to draw": ({"method": "sobol", "count": 3}, GOOD, "sampling.method", "distribution"),
@@ -333,7 +340,7 @@ BAD_DRAWS = {
 
 @pytest.mark.parametrize(("sampling", "axis", "field", "said"), BAD_DRAWS.values(), ids=BAD_DRAWS)
 def test_bad_sampling_is_refused_with_its_path(sampling, axis, field, said):
-    error = refused(axis, sampling=sampling)
+    error = refused(*filter(None, [axis]), sampling=sampling)
     assert error.field == field
     assert said in str(error)
 
