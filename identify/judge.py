@@ -12,12 +12,12 @@ from scipy.optimize import lsq_linear
 
 from identify.step_test import settling
 from jaxmpc.model.step_response import StepResponseModel
-from jaxmpc.process.process import Process
+from jaxmpc.process.process import Process, amount
 
 NOTHING = 1e-4  # spans of a CV per span of an MV: no response
 FAST, SLOW = 3, 0.9  # samples to 63 % of a gain; share of the model's length
 ILL = 30.0  # condition number of the gains in spans from which on directions differ much
-Level = Literal["fine", "look", "wrong"]
+Level = Literal["fine", "look"]
 
 
 class Finding(NamedTuple):
@@ -51,14 +51,20 @@ def _pairs(process: Process, model: StepResponseModel) -> list[Finding]:
     for row in settling(model):
         i, j = process.cv_names.index(row.cv), process.mv_names.index(row.mv)
         cv, mv, subject = process.cvs[i], process.mvs[j], f"{row.mv} on {row.cv}"
-        unit = f"{cv.unit} per {mv.unit}"
+        unit = f"{cv.unit} per {mv.unit}" if {cv.unit, mv.unit} - {"", "1"} else ""
         peak = np.abs(s[i, j]).max()
         if peak * scale[i, j] < NOTHING:
-            out.append(Finding("look", subject, f"no response: at most {peak:.3g} {unit}"))
+            words = f"no response: at most {peak:.3g} {unit}".rstrip()
+            out.append(
+                Finding("look", subject, f"{words}; if there should be one, look at the model and the spans")
+            )
             continue
         begin = int(np.argmax(np.abs(s[i, j]) > 0.02 * peak))
         rise = (int(np.argmax(np.abs(s[i, j]) >= 0.63 * abs(row.gain))) + 1 - begin) if row.gain else 0
-        words = f"gain {row.gain:.4g} {unit}, dead time {begin * model.dt:g} s, settled after {row.settling_time:g} s"
+        words = (
+            f"gain {row.gain:.4g} {unit}".rstrip()
+            + f", dead time {begin * model.dt:g} s, settled after {row.settling_time:g} s"
+        )
         if not row.settled:
             slope = (s[i, j, -1] - s[i, j, -2]) / model.dt if model.samples > 1 else np.inf
             words = (
@@ -96,7 +102,10 @@ def _gains(process: Process, model: StepResponseModel) -> list[Finding]:
     values = np.linalg.svd(scaled, compute_uv=False)
     strength = f"strongest direction {values[0]:.3g}, weakest {values[-1]:.3g} spans of CVs per span of MVs"
     if values[-1] <= 0 or values[0] / values[-1] > ILL:
-        words = f"{strength}: setpoints in the weak direction need large moves or cannot be reached together"
+        words = (
+            f"{strength}: setpoints in the weak direction need large moves or cannot be reached together: "
+            "weigh the CVs by what matters"
+        )
         return [Finding("look", "gains", words)]
     return [Finding("fine", "gains", strength)]
 
@@ -111,9 +120,13 @@ def _steps(process: Process, model: StepResponseModel) -> list[Finding]:
         step = mv.actuator.step if listed is None else float(np.diff(listed).max())
         for i, cv in enumerate(process.cvs):
             effect, zone = abs(gains[i, j]) * float(step or 0.0), float(zones[i])
-            words = f"one step of {step:g} {mv.unit} moves it by {effect:.3g} {cv.unit}, deadzone +-{zone:g} {cv.unit}"
+            words = f"one step of {amount(step, mv.unit)} moves it by {amount(effect, cv.unit)}"
+            words += f", deadzone +-{amount(zone, cv.unit)}"
             if effect > 2 * zone:
-                words += ": between two steps no position keeps it inside; rounding hunts, whole moves rest off the setpoint"
+                words += (
+                    f": between two steps no position keeps it inside; rounding hunts, whole moves rest off the setpoint, "
+                    f"unless the deadzone is +-{amount(effect / 2, cv.unit)}"
+                )
                 out.append(Finding("look", f"{mv.name} on {cv.name}", words))
             else:
                 out.append(Finding("fine", f"{mv.name} on {cv.name}", words))
@@ -138,10 +151,11 @@ def _references(process: Process, model: StepResponseModel) -> list[Finding]:
                 worst = int(np.abs(found.fun).argmax())
                 cv = process.cvs[worst]
                 miss = abs(found.fun[worst]) * process.settled[worst]
-                away.append(f"from {start:g} s: {cv.name} at least {miss:.3g} {cv.unit} off")
+                away.append(f"from {start:g} s: {cv.name} at least {amount(miss, cv.unit)} off")
         subject = f"references.{name}"
         if away:
             words = f"{len(away)} of {len(reference.times)} setpoints cannot be held by the model: {'; '.join(away[:3])}"
+            words += "; ask for others, or widen low and high of the MVs"
             out.append(Finding("look", subject, words))
         else:
             out.append(
