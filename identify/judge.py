@@ -73,9 +73,8 @@ def _pairs(process: Process, model: StepResponseModel) -> list[Finding]:
             )
             out.append(Finding("look", subject, words))
         elif rise < FAST:
-            advice = (
-                f"reaches 63 % within {rise} samples of {model.dt:g} s: sample faster, or filter less is seen"
-            )
+            count = f"{rise} sample{'s' if rise > 1 else ''} of {model.dt:g} s"
+            advice = f"reaches 63 % within {count}: what it does in between is not seen; sample faster"
             out.append(Finding("look", subject, f"{words}; {advice}"))
         elif row.gain * s[i, j, begin] < 0:
             out.append(
