@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import re
 from collections.abc import Iterable
 from typing import Any
 
@@ -165,15 +166,37 @@ class FmuDescription:
         return cls(**(facts | own))
 
     def variable(self, field: str, name: str) -> FmuVariable:
-        """A variable with one value by its name, or an `InputError` that names the field."""
+        """A variable with one value by its name, or an `InputError` that names the field.
+
+        An element of an array is one, too: ``x[2,1]``, counted from 1.
+        """
+        if name not in self.variables and (element := self._element(name)):
+            return element
         if name not in self.variables:
             expected = f"a variable of the FMU, which jaxmpc fmu info lists ({len(self.variables)} of them)"
             raise InputError(field, name, expected, near(name, self.variables))
         found = self.variables[name]
         if found.shape:
             size = " x ".join(map(str, found.shape))
-            raise InputError(field, name, f"a variable with one value (it is an array of {size})")
+            ones = ",".join("1" * len(found.shape))
+            expected = f"a variable with one value, such as {name}[{ones}] (it is an array of {size})"
+            raise InputError(field, name, expected)
         return found
+
+    def _element(self, name: str) -> FmuVariable | None:
+        array, _, index = name.removesuffix("]").rpartition("[")
+        if array not in self.variables or not re.fullmatch(r"\d+(,\d+)*", index):
+            return None
+        whole, indices = self.variables[array], [int(k) for k in index.split(",")]
+        inside = (1 <= k <= size for k, size in zip(indices, whole.shape, strict=False))
+        if len(indices) != len(whole.shape) or not all(inside):
+            return None
+        place = 0
+        for size, k in zip(whole.shape, indices, strict=True):
+            place = place * size + k - 1
+        starts = (whole.start or "").split()
+        start = starts[place if len(starts) > 1 else 0] if starts else None
+        return dataclasses.replace(whole, name=name, start=start, shape=())
 
     def step_of(self, dt: float, substep: float | None) -> tuple[float, int]:
         """The communication step [s] and how many of them make a sampling interval `dt` [s].

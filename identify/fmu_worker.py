@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import mmap
 import os
 import re
@@ -200,6 +201,7 @@ class Runner:
         self._described = read_description(self.path, self.folder)
         self.fmi = 3 if self._described.fmiVersion.startswith("3") else 2
         self._references = {v.name: (v.type, v.valueReference) for v in self._described.modelVariables}
+        self._shapes = {v.name: v.shape for v in self._described.modelVariables if v.shape}
         with zipfile.ZipFile(self.path) as archive:
             return facts_of(self._described, archive.namelist())
 
@@ -261,20 +263,51 @@ class Runner:
         self._fmu.exitInitializationMode()
 
     def set(self, values: dict[str, Any]) -> None:
-        """Set variables."""
+        """Set variables and elements of arrays."""
+        values, arrays = dict(values), {}
+        for name in [name for name in values if name not in self._references]:
+            array, k = self._element(name)
+            arrays.setdefault(array, {})[k] = values.pop(name)
         for kind, names in self._by_type(values).items():
             self._begin(f"set{kind} at t = {self._time:.10g} s")
             references = [self._references[name][1] for name in names]
             getattr(self._fmu, f"set{kind}")(references, [values[name] for name in names])
+        for array, elements in arrays.items():
+            whole = self._array(array)
+            for k, value in elements.items():
+                whole[k] = value
+            ((kind, _),) = self._by_type([array]).items()
+            self._begin(f"set{kind} at t = {self._time:.10g} s")
+            getattr(self._fmu, f"set{kind}")([self._references[array][1]], whole)
 
     def get(self, names: list[str]) -> list[Any]:
-        """Values of variables, in the order of the names."""
+        """Values of variables and elements of arrays, in the order of the names."""
         found = {}
-        for kind, some in self._by_type(names).items():
+        for name in names:
+            if name not in self._references:
+                array, k = self._element(name)
+                found[name] = self._array(array)[k]
+        for kind, some in self._by_type(name for name in names if name not in found).items():
             self._begin(f"get{kind} at t = {self._time:.10g} s")
             references = [self._references[name][1] for name in some]
             found.update(zip(some, getattr(self._fmu, f"get{kind}")(references), strict=True))
         return [found[name] for name in names]
+
+    def _array(self, name: str) -> list[Any]:
+        """All elements of an array, the last index first."""
+        ((kind, _),) = self._by_type([name]).items()
+        self._begin(f"get{kind} at t = {self._time:.10g} s")
+        return getattr(self._fmu, f"get{kind}")([self._references[name][1]], math.prod(self._shapes[name]))
+
+    def _element(self, name: str) -> tuple[str, int]:
+        """Array and place of an element such as ``x[2,1]``, counted from 1."""
+        array, _, index = name.removesuffix("]").rpartition("[")
+        if array not in self._shapes:
+            raise RefusedError(f"an FMU with a variable {name}")
+        place = 0
+        for size, k in zip(self._shapes[array], index.split(","), strict=True):
+            place = place * size + int(k) - 1
+        return array, place
 
     def step(self, dt: float, count: int) -> None:
         """Step `count` times by `dt` [s]."""
@@ -308,8 +341,6 @@ class Runner:
         """Names by the type in the names of FMPy's methods."""
         groups: dict[str, list[str]] = {}
         for name in names:
-            if name not in self._references:
-                raise RefusedError(f"an FMU with a variable {name}")
             kind = self._references[name][0]
             if kind == "Enumeration":
                 kind = "Int64" if self.fmi == 3 else "Integer"

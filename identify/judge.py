@@ -12,12 +12,12 @@ from scipy.optimize import lsq_linear
 
 from identify.step_test import settling
 from jaxmpc.model.step_response import StepResponseModel
-from jaxmpc.process.process import Process
+from jaxmpc.process.process import Process, amount
 
 NOTHING = 1e-4  # spans of a CV per span of an MV: no response
 FAST, SLOW = 3, 0.9  # samples to 63 % of a gain; share of the model's length
 ILL = 30.0  # condition number of the gains in spans from which on directions differ much
-Level = Literal["fine", "look", "wrong"]
+Level = Literal["fine", "look"]
 
 
 class Finding(NamedTuple):
@@ -46,30 +46,32 @@ def _spans(process: Process) -> np.ndarray:
 
 
 def _pairs(process: Process, model: StepResponseModel) -> list[Finding]:
-    out, scale = [], _spans(process)
-    s = np.asarray(model.coefficients)
+    out: list[Finding] = []
+    s = np.concatenate([np.asarray(model.coefficients), np.asarray(model.dv_coefficients)], axis=1)
+    inputs = {v.name: v for v in (*process.mvs, *process.disturbances)}
+    places = {name: j for j, name in enumerate((*model.mv_names, *model.dv_names))}
     for row in settling(model):
-        i, j = process.cv_names.index(row.cv), process.mv_names.index(row.mv)
-        cv, mv, subject = process.cvs[i], process.mvs[j], f"{row.mv} on {row.cv}"
-        unit = f"{cv.unit} per {mv.unit}"
+        i, j = process.cv_names.index(row.cv), places[row.mv]
+        cv, mv, subject = process.cvs[i], inputs[row.mv], f"{row.mv} on {row.cv}"
+        unit = "" if cv.unit == mv.unit == "1" else f" {cv.unit} per {mv.unit}"
         peak = np.abs(s[i, j]).max()
-        if peak * scale[i, j] < NOTHING:
-            out.append(Finding("look", subject, f"no response: at most {peak:.3g} {unit}"))
+        if peak * mv.span / cv.span < NOTHING:
+            words = f"no response: at most {peak:.3g}{unit}; if there should be one, look at the model and the spans"
+            out.append(Finding("look", subject, words))
             continue
         begin = int(np.argmax(np.abs(s[i, j]) > 0.02 * peak))
         rise = (int(np.argmax(np.abs(s[i, j]) >= 0.63 * abs(row.gain))) + 1 - begin) if row.gain else 0
-        words = f"gain {row.gain:.4g} {unit}, dead time {begin * model.dt:g} s, settled after {row.settling_time:g} s"
+        words = f"gain {row.gain:.4g}{unit}, dead time {begin * model.dt:g} s, settled after {row.settling_time:g} s"
         if not row.settled:
             slope = (s[i, j, -1] - s[i, j, -2]) / model.dt if model.samples > 1 else np.inf
             words = (
-                f"not settled by sample {model.samples}: still moves {slope:.3g} {unit} per second; the prediction holds "
+                f"not settled by sample {model.samples}: still moves {slope:.3g}{unit} per second; the prediction holds "
                 "the last value, so give the model more samples, or a CV that does not integrate"
             )
             out.append(Finding("look", subject, words))
         elif rise < FAST:
-            advice = (
-                f"reaches 63 % within {rise} samples of {model.dt:g} s: sample faster, or filter less is seen"
-            )
+            count = f"{rise} sample{'s' if rise > 1 else ''} of {model.dt:g} s"
+            advice = f"reaches 63 % within {count}: what it does in between is not seen; sample faster"
             out.append(Finding("look", subject, f"{words}; {advice}"))
         elif row.gain * s[i, j, begin] < 0:
             out.append(
@@ -85,6 +87,14 @@ def _horizons(process: Process, model: StepResponseModel) -> list[Finding]:
     longest = max((row.settling_time for row in settling(model) if row.settled), default=0.0)
     ahead = structure.prediction_horizon * process.dt
     subject = "prediction_horizon"
+    if all(mv.actuator.kind == "on-off" for mv in process.mvs):
+        if structure.prediction_horizon > 1.5 * structure.control_horizon:
+            words = (
+                f"{ahead:g} s, of which {structure.control_horizon * process.dt:g} s are the control horizon: what is on or "
+                "off at its end stays so, and the plan is chosen by that; look less far ahead"
+            )
+            return [Finding("look", subject, words)]
+        return [Finding("fine", subject, f"{ahead:g} s; what is on or off never settles")]
     if ahead < longest:
         words = f"{ahead:g} s; the slowest response settles after {longest:g} s: look further ahead, or expect offset"
         return [Finding("look", subject, words)]
@@ -96,7 +106,10 @@ def _gains(process: Process, model: StepResponseModel) -> list[Finding]:
     values = np.linalg.svd(scaled, compute_uv=False)
     strength = f"strongest direction {values[0]:.3g}, weakest {values[-1]:.3g} spans of CVs per span of MVs"
     if values[-1] <= 0 or values[0] / values[-1] > ILL:
-        words = f"{strength}: setpoints in the weak direction need large moves or cannot be reached together"
+        words = (
+            f"{strength}: setpoints in the weak direction need large moves or cannot be reached together: "
+            "weigh the CVs by what matters"
+        )
         return [Finding("look", "gains", words)]
     return [Finding("fine", "gains", strength)]
 
@@ -104,16 +117,23 @@ def _gains(process: Process, model: StepResponseModel) -> list[Finding]:
 def _steps(process: Process, model: StepResponseModel) -> list[Finding]:
     out = []
     gains = np.asarray(model.coefficients)[:, :, -1]
-    zones = process.tuning(process.structure()).deadzone
+    tuning = process.tuning(process.structure())
+    costs = np.asarray(tuning.cv_weight + tuning.soft_quadratic + tuning.soft_linear)
     for j in process.stepped:
         mv = process.mvs[j]
         listed = mv.actuator.listed
         step = mv.actuator.step if listed is None else float(np.diff(listed).max())
         for i, cv in enumerate(process.cvs):
-            effect, zone = abs(gains[i, j]) * float(step or 0.0), float(zones[i])
-            words = f"one step of {step:g} {mv.unit} moves it by {effect:.3g} {cv.unit}, deadzone +-{zone:g} {cv.unit}"
+            if not costs[i]:
+                continue  # no setpoint counts
+            effect, zone = abs(gains[i, j]) * float(step or 0.0), float(tuning.deadzone[i])
+            moved, allowed = amount(effect, cv.unit), amount(zone, cv.unit)
+            words = f"one step of {amount(step, mv.unit)} moves it by {moved}, deadzone +-{allowed}"
             if effect > 2 * zone:
-                words += ": between two steps no position keeps it inside; rounding hunts, whole moves rest off the setpoint"
+                words += (
+                    f": between two steps no position keeps it inside; rounding hunts, whole moves rest off the setpoint, "
+                    f"unless the deadzone is +-{amount(effect / 2, cv.unit)}"
+                )
                 out.append(Finding("look", f"{mv.name} on {cv.name}", words))
             else:
                 out.append(Finding("fine", f"{mv.name} on {cv.name}", words))
@@ -138,10 +158,11 @@ def _references(process: Process, model: StepResponseModel) -> list[Finding]:
                 worst = int(np.abs(found.fun).argmax())
                 cv = process.cvs[worst]
                 miss = abs(found.fun[worst]) * process.settled[worst]
-                away.append(f"from {start:g} s: {cv.name} at least {miss:.3g} {cv.unit} off")
+                away.append(f"from {start:g} s: {cv.name} at least {amount(miss, cv.unit)} off")
         subject = f"references.{name}"
         if away:
             words = f"{len(away)} of {len(reference.times)} setpoints cannot be held by the model: {'; '.join(away[:3])}"
+            words += "; ask for others, or widen low and high of the MVs"
             out.append(Finding("look", subject, words))
         else:
             out.append(

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from identify.working_point import Values, check_mv, facts_of, in_order, point_of, signals_of, start
+from identify.working_point import Values, check_mv, facts_of, in_order, point_of, signals_of, start, units_of
 from jaxmpc.check import is_count, is_number
 from jaxmpc.errors import InputError, near
 from jaxmpc.model.step_response import StepResponseModel, make_model
@@ -96,7 +96,10 @@ def apply_sequence(
             pieces.append((np.asarray(outputs.cv), np.asarray(outputs.mv)))
         cv, mv = (np.concatenate(parts)[: len(demands)] for parts in zip(*pieces, strict=True))
         return cv, mv
-    outputs = [plant.step(demand, off) for demand, off in zip(demands, disturbances, strict=True)]
+    given = (
+        disturbances if hasattr(plant, "disturbance_names") else disturbances[:, 0]
+    )  # a number where it has no names
+    outputs = [plant.step(demand, off) for demand, off in zip(demands, given, strict=True)]
     return np.array([o.cv for o in outputs]), np.array([o.mv for o in outputs])
 
 
@@ -143,7 +146,9 @@ def identify_step_response(
     change = in_order("steps", getattr(plant, "test_steps", None) if steps is None else steps, signals)
     if not change.all():
         j = int(np.argmin(np.abs(change)))
-        raise InputError(f"steps.{signals.mv_names[j]}", 0.0, "a step that is not zero")
+        raise InputError(
+            f"steps.{signals.mv_names[j]}", 0.0, f"a step that is not zero [{units_of(signals)[j]}]"
+        )
     sizes = _disturbance_sizes(plant, disturbance_steps or {})
     ways = (1.0, -1.0) if both_ways else (1.0,)
     for way in ways:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from identify.working_point import Values, check_mv, point_of, signals_of
+from identify.working_point import Values, check_mv, point_of, signals_of, units_of
 from jaxmpc.check import as_floats
 from jaxmpc.errors import InputError
 from jaxmpc.process.plant import JaxPlant, Signals
@@ -78,11 +78,12 @@ def steady_sweep(
     first, second = found.values()
     point = point_of(plant, signals, working_point)
     check_mv(plant, [found.get(name, value) for name, value in zip(names, point, strict=True)])
-    if first.ndim != 1 or len(first) < 2 or (np.diff(first) <= 0).any():
-        unit = (signals.mv_units or ("MV unit",) * len(names))[names.index(next(iter(found)))]
-        raise InputError(
-            f"grid.{next(iter(found))}", first.tolist(), f"two or more increasing values [{unit}]"
-        )
+    for (name, values), least in zip(found.items(), (2, 1), strict=True):
+        expected = f"{'two or more increasing' if least == 2 else 'one or more finite'} values"
+        wrong = values.ndim != 1 or len(values) < least or not np.isfinite(values).all()
+        if wrong or (least == 2 and (np.diff(values) <= 0).any()):
+            unit = units_of(signals)[names.index(name)]
+            raise InputError(f"grid.{name}", values.tolist(), f"{expected} [{unit}]")
     mv = np.tile(point, (len(second), len(first), 1))
     along, across = (names.index(name) for name in found)
     mv[..., along], mv[..., across] = first, second[:, None]

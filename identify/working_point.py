@@ -79,7 +79,7 @@ def point_of(plant: Any, signals: Signals, given: Values | None) -> Float[np.nda
 def in_order(path: str, given: Values | None, signals: Signals) -> Float[np.ndarray, " mv"]:
     """One finite number for each MV, given by name or in MV order."""
     names = signals.mv_names
-    units = signals.mv_units or ("MV unit",) * len(names)
+    units = units_of(signals)
     expected = f"a number for each of {', '.join(map('{} [{}]'.format, names, units))}"
     if isinstance(given, Mapping):
         if set(given) != set(names):
@@ -94,7 +94,12 @@ def in_order(path: str, given: Values | None, signals: Signals) -> Float[np.ndar
     return values
 
 
+def units_of(signals: Signals) -> tuple[str, ...]:
+    """Units of the MVs for messages."""
+    return tuple(unit or "MV unit" for unit in signals.mv_units or ("",) * len(signals.mv_names))
+
+
 def check_mv(plant: Any, mv: Sequence[Any] | np.ndarray) -> None:
     """Refuse MVs, one value or an array each, that are outside the range of a plant that says it."""
     if hasattr(plant, "check_mv"):
-        plant.check_mv(mv)
+        plant.check_mv([np.asarray(one).tolist() for one in mv])

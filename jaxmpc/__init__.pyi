@@ -9,6 +9,7 @@ from jaxmpc.controller.measurement import fault_errors as fault_errors
 from jaxmpc.controller.plan import solve_plan as solve_plan
 from jaxmpc.controller.targets import TargetController as TargetController
 from jaxmpc.errors import InputError as InputError
+from jaxmpc.loop.events import Event as Event
 from jaxmpc.loop.simulate import simulate as simulate
 from jaxmpc.loop.simulate import simulate_batch as simulate_batch
 from jaxmpc.loop.simulate import simulate_batches as simulate_batches
@@ -19,9 +20,11 @@ from jaxmpc.problem.structure import Structure as Structure
 from jaxmpc.problem.tuning import make_tuning as make_tuning
 from jaxmpc.problem.tuning import stack_tunings as stack_tunings
 from jaxmpc.process.actuator import Actuator as Actuator
+from jaxmpc.process.file import load_process as load_process
 from jaxmpc.process.function_plant import FunctionPlant as FunctionPlant
 from jaxmpc.process.model_plant import ModelPlant as ModelPlant
 from jaxmpc.process.plant import Parameter as Parameter
+from jaxmpc.process.process import Process as Process
 from jaxmpc.process.reference import Reference as Reference
 from jaxmpc.process.well.plant import WellPlant as WellPlant
 from jaxmpc.steady.map import SteadyMap as SteadyMap

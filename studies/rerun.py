@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from identify.plants import disturbance_of, open_plant
+from identify.plants import closing, disturbance_of, open_plant
 from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
 from jaxmpc.files import from_strict_json, write_atomically
@@ -76,8 +76,11 @@ def study_of(store: Path) -> Study:
     with open_study(store) as data:
         body, folder = provenance(data, "definition"), provenance(data, "folder")
         quick = provenance(data, "quick")
-    if not isinstance(body, dict):
-        raise InputError("store", str(store), "a store of a sweep study, with its definition")
+    if not isinstance(body, dict) or "study" not in body:
+        expected = (
+            "the store of a sweep; a comparison has every sample of its runs already, and figures of them"
+        )
+        raise InputError("store", str(store), expected)
     definition = StudyDefinition.from_dict(from_strict_json(body), folder or ".")
     made = expand(definition, quick=bool(quick), confirmed=True)
     return made.evaluated(store) if isinstance(made, SearchStudy) else made
@@ -139,8 +142,8 @@ def close_loop(
     # arrays: no program of its own for every scenario
     parameters = {name: np.float64(value) for name, value in scenario.plant.items()}
     actual = scenario.actuator == "step"
-    plant = open_plant(process, study.definition.study.plant, actual=actual, parameters=parameters)
-    try:
+    opened = open_plant(process, study.definition.study.plant, actual=actual, parameters=parameters)
+    with closing(opened) as plant:
         return simulate(
             Controller(scenario.structure, scenario.tuning, model),
             plant,
@@ -150,10 +153,9 @@ def close_loop(
             noise=scenario.noise,
             faults=scenario.faults,
             position_feedback=scenario.position_feedback,
+            preview=scenario.preview,
+            events=scenario.events,
             seed=scenario.seed,
             keep_plans=keep_plans,
             progress=progress,
         )
-    finally:
-        if hasattr(plant, "close"):
-            plant.close()

@@ -103,6 +103,8 @@ DESCRIPTION3 = """<?xml version="1.0" encoding="UTF-8"?>
     <Float64 name="time" valueReference="0" causality="independent"/>
     <Float64 name="sum" valueReference="1" causality="output"/>{variables}
     <Float64 name="row" valueReference="30" causality="input" start="0 0"><Dimension start="2"/></Float64>
+    <Float64 name="table" valueReference="32" causality="local" initial="exact" start="1 2 3 4 5 6">
+      <Dimension start="2"/><Dimension start="3"/></Float64>
   </ModelVariables>
   <ModelStructure><Output valueReference="1"/></ModelStructure>
 </fmiModelDescription>
@@ -126,10 +128,10 @@ SOURCE3 = """
 #include <string.h>
 static double x[64];
 static double sum(void) { double s = 0; for (int i = 2; i < 64; i++) { s += x[i]; } return s; }
-#define TYPE(T, t) int fmi3Set##T(void *c, const unsigned *vr, size_t n, const t *v) \\
-    { for (size_t i = 0; i < n; i++) { x[vr[i]] = v[i]; } return 0; } \\
-    int fmi3Get##T(void *c, const unsigned *vr, size_t n, t *v) \\
-    { for (size_t i = 0; i < n; i++) { v[i] = vr[i] == 1 ? sum() : x[vr[i]]; } return 0; }
+#define TYPE(T, t) int fmi3Set##T(void *c, const unsigned *vr, size_t n, const t *v, size_t m) \\
+    { for (size_t i = 0; i < m; i++) { x[n == m ? vr[i] : vr[0] + i] = v[i]; } return 0; } \\
+    int fmi3Get##T(void *c, const unsigned *vr, size_t n, t *v, size_t m) \\
+    { for (size_t i = 0; i < m; i++) { unsigned k = n == m ? vr[i] : vr[0] + i; v[i] = k == 1 ? sum() : x[k]; } return 0; }
 TYPE(Float64, double) TYPE(Float32, float) TYPE(Boolean, bool)
 TYPE(Int8, int8_t) TYPE(Int16, int16_t) TYPE(Int32, int32_t) TYPE(Int64, int64_t)
 TYPE(UInt8, uint8_t) TYPE(UInt16, uint16_t) TYPE(UInt32, uint32_t) TYPE(UInt64, uint64_t)

@@ -5,6 +5,7 @@ An import counts wherever it stands in its file. What breaks a rule today is in 
 
 import ast
 import importlib.util
+import re
 from pathlib import Path
 
 import pytest
@@ -262,3 +263,23 @@ def test_an_exception_that_is_not_needed_any_more_is_not_kept():
             others = {name: used - EXCEPTIONS.get(name, set()) for name, used in graph.items()}
             others[module] |= {target}
             assert in_circles(others), (module, target)
+
+
+# what may speak of the well: its own code, its files, the thesis's studies and their figures, and the library
+OF_THE_WELL = (
+    "jaxmpc/process/well/",
+    "jaxmpc/process/library/",
+    "identify/well",
+    "studies/thesis/",
+    "figures/thesis/",
+)
+WORDS = re.compile(r"(?<![a-z])(chokes?|oil|gas|lift)(?![a-z])")
+
+
+@pytest.mark.parametrize(
+    "path", [p for p in sources() if not name_of(p).startswith(OF_THE_WELL)], ids=name_of
+)
+def test_general_code_names_nothing_of_the_well(path):
+    text = path.read_text().lower().replace("gas-lifted-well", "")  # the process of studies that name none
+    found = [f"{i}: {line.strip()}" for i, line in enumerate(text.splitlines(), 1) if WORDS.search(line)]
+    assert not found, f"{name_of(path)}:{found[0]}"

@@ -9,7 +9,9 @@ from jaxmpc.cli.options import Options, command, option, switch
 
 @command(
     "explore",
-    option("process", "PROCESS", "a process file, or a shipped process (default: the thesis's)", str, nargs="?"),
+    option(
+        "process", "PROCESS", "a process file, or a shipped process (default: the thesis's)", str, nargs="?"
+    ),
     option("--store", "PATH", "study to open on the second page", Path),
     option("--port", "N", "of the local server (default: a free one)", int),
     switch("--headless", "only serve and print the address"),

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
 from pathlib import Path
-from typing import Any
 
-from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, PLANTS, Options, choice, command, option
-from jaxmpc.errors import InputError
+from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, choice, command, named_number, option
+from jaxmpc.errors import InputError, near
 from jaxmpc.files import check_target
 
 
@@ -18,7 +16,7 @@ from jaxmpc.files import check_target
     option("--out", "FILE.fmu", "where to write (default: the cache of built FMUs)", Path),
 )
 def build(options: Options) -> int:
-    """Build the gas-lifted well as a co-simulation FMU; needs a C compiler."""
+    """Build the shipped well as a co-simulation FMU; needs a C compiler."""
     from identify.well_fmu import build_fmu
 
     if options.out is not None:
@@ -42,27 +40,45 @@ def info(options: Options) -> int:
 
 @command(
     "identify",
-    choice("--plant", PLANTS, "the FMU or the JAX well"),
-    option("--choke", "PERCENT", "choke to start from [%%]", 50.0),
-    option("--lift", "RATE", "lift to start from [m3/h]", 7500.0),
-    option("--steps", ("CHOKE", "LIFT"), "steps of choke [%%] and lift [m3/h]", (2.0, 100.0), nargs=2),
-    option("--samples", "N", "coefficients N [samples of 10 s]", 250),
+    option(
+        "process",
+        "PROCESS",
+        "process file or shipped process (default: the well of the thesis)",
+        str,
+        nargs="?",
+    ),
+    option("--plant", "NAME", "which plant of the process (default: the first)", ""),
+    option(
+        "--at",
+        "MV=VALUE",
+        "where an MV stands before the steps, if not as the process says",
+        str,
+        action="append",
+    ),
+    option("--step", "MV=SIZE", "step of an MV, if not as the process says", str, action="append"),
+    option("--samples", "N", "coefficients [samples] (default: as the process says)", int),
     option("--out", "MODEL.json", "where to write", Path("model.json")),
 )
 def identify(options: Options) -> int:
-    """Identify a step-response model: settle the plant and step each MV alone."""
+    """Identify a step-response model: settle a plant and step each MV, and each measured disturbance, alone."""
     check_target("--out", options.out)
-    from identify.step_test import identify_step_response, settling_notes
-    from jaxmpc.process.well.plant import WellPlant
+    from identify.plants import closing, identified, open_plant
+    from identify.step_test import settling_notes
+    from jaxmpc.process.file import DEFAULT_PROCESS, load_process
 
-    with contextlib.ExitStack() as stack:
-        plant: Any = WellPlant()
-        if options.plant == "fmu":
-            from identify.well_fmu import WellFmuPlant
-
-            plant = stack.enter_context(WellFmuPlant())
-        start = {"choke": options.choke, "gas_lift": options.lift}
-        model = identify_step_response(plant, start, options.steps, options.samples)
+    process = load_process(options.process or DEFAULT_PROCESS)
+    point, steps = (
+        dict(named_number(name, text) for text in given or ())
+        for name, given in (("--at", options.at), ("--step", options.step))
+    )
+    for name, given in (("--at", point), ("--step", steps)):
+        for mv in given:
+            if mv not in process.mv_names:
+                raise InputError(
+                    name, mv, f"an MV: {', '.join(process.mv_names)}", near(mv, process.mv_names)
+                )
+    with closing(open_plant(process, options.plant, actual=False)) as plant:
+        model = identified(process, plant, point, steps, options.samples)
     for note in settling_notes(model):
         print(f"jaxmpc: {note}", file=sys.stderr)
     print(model.save(options.out))

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from jaxmpc.errors import InputError
 from jaxmpc.programs import interrupts
 
 EXIT_OPTIMAL, EXIT_OTHER, EXIT_BAD_INPUT, EXIT_INFEASIBLE, EXIT_LIMIT = 0, 1, 2, 3, 4
@@ -96,6 +97,19 @@ def parser(commands: Mapping[str, Command]) -> argparse.ArgumentParser:
             single.get(dest, made).add_argument(argument, **settings)
         made.set_defaults(run=command.run)
     return whole
+
+
+def named_number(option: str, text: str) -> tuple[str, float]:
+    """``NAME=NUMBER`` taken apart.
+
+    Raises:
+        InputError: naming the option.
+    """
+    name, _, number = text.partition("=")
+    try:
+        return name, float(number)
+    except ValueError:
+        raise InputError(option, text, "NAME=NUMBER, such as valve=2") from None
 
 
 def complain(error: object, status: int) -> int:

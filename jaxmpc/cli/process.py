@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, command, option
+from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, command, named_number, option
 from jaxmpc.errors import InputError
 from jaxmpc.files import check_folder, check_target
 
@@ -32,7 +32,11 @@ def new(options: Options) -> int:
     name = _named(out.stem)
     file = _relative(options.model, out.parent)
     text, guesses = new_process(
-        model, file, name, steps=dict(map(_sized, options.step or ())), switches=options.on_off or ()
+        model,
+        file,
+        name,
+        steps=dict(named_number("--step", text) for text in options.step or ()),
+        switches=options.on_off or (),
     )
     write_atomically(out, text)
     load_process(out)
@@ -54,14 +58,6 @@ def _relative(file: Path, folder: Path) -> str:
         return file.resolve().relative_to(folder.resolve()).as_posix()
     except ValueError:
         return str(file.resolve())
-
-
-def _sized(text: str) -> tuple[str, float]:
-    name, _, size = text.partition("=")
-    try:
-        return name, float(size)
-    except ValueError:
-        raise InputError("--step", text, "MV=SIZE, such as valve=2") from None
 
 
 @command(
@@ -96,6 +92,36 @@ def check(options: Options) -> int:
     measured = list(zip(model.dv_names, model.dv_units or ("1",) * len(model.dv_names), strict=True))
     for path in draw_responses(process, responses, measured, options.out):
         print(path)
+    return EXIT_OPTIMAL
+
+
+@command(
+    "process keys",
+    option("process", "PROCESS", "a process file, or the name of a shipped process", str),
+    option("--plant", "NAME", "which plant of the process (default: the first)", ""),
+    epilog=EXITS,
+)
+def keys(options: Options) -> int:
+    """List every key that studies of a process may set and vary, with unit, default and meaning."""
+    from identify.plants import parameters_of
+    from jaxmpc.process.file import load_process
+    from studies.definition.fields import as_text, study_fields
+
+    process = load_process(options.process)
+    tuning = process.tuning(process.structure())
+    at = {name: i for names in (process.cv_names, process.mv_names) for i, name in enumerate(names)}
+    rows = [("key", "unit", "default", "meaning")]
+    for key, field in study_fields(process, parameters_of(process, options.plant)).items():
+        given = field.default
+        if given is None and key.startswith("tuning."):
+            name, _, channel = key.removeprefix("tuning.").partition(".")
+            given = getattr(tuning, name)
+            given = float(given[at[channel]] if channel else given)
+        given = "" if given is None else given
+        rows.append((key, field.unit, given if isinstance(given, str) else as_text(given), field.label))
+    wide = [max(len(str(row[i])) for row in rows) for i in range(3)]
+    for row in rows:
+        print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, (*wide, 0), strict=True)).rstrip())
     return EXIT_OPTIMAL
 
 

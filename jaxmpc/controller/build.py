@@ -21,7 +21,7 @@ from jaxmpc.problem.condense import CondensedQp, Matrices, condense, matrices_of
 from jaxmpc.problem.layout import Layout, Size, layout_of, rung
 from jaxmpc.problem.memory import check_size
 from jaxmpc.problem.structure import Structure, check_match
-from jaxmpc.problem.tuning import Tuning, stack_tunings, within_values
+from jaxmpc.problem.tuning import Tuning, within_values
 from jaxmpc.programs.lanes import Lanes, lanes_of
 
 AT_ONCE = 64  # lanes that are condensed together
@@ -158,8 +158,9 @@ class Scenarios:
         if not self.lanes:
             qp = _condense(layout_of(self.structure, size), size, self.tunings[0], each[0], **options)
             return lanes_of([qp])
-        matrices = lanes_of(each if own else each[:1])
-        layouts, tunings = self.layouts(), stack_tunings(self.tunings)
+        matrices = lanes_of(each, shared=not own)
+        # on the host, where another number of them needs no program of its own
+        layouts, tunings = self.layouts(), jax.tree.map(lambda *v: np.stack(v), *self.tunings)
         found = []
         for begin in range(0, self.count, AT_ONCE):
             index = np.minimum(begin + np.arange(AT_ONCE), self.count - 1)
@@ -177,7 +178,7 @@ class Scenarios:
     def layouts(self) -> Lanes[Layout]:
         """Structures as arrays."""
         layouts = [layout_of(s, self.size) for s in self.structures]
-        return lanes_of(layouts if self.own.structure else layouts[:1])
+        return lanes_of(layouts, shared=not self.own.structure)
 
     def constants(self, qps: Lanes[CondensedQp]) -> list[Constants]:
         """What searches need of the problems, one per scenario or a single one where all share it."""
@@ -190,13 +191,12 @@ class Scenarios:
         """Everything that compiled programs know, shared where it is given once."""
         restricted = any(s.has_gaps_or_dwell for s in self.structures)
         made = [c.tables(self.integers, restricted) for c in constants]
-        tables = lanes_of(made) if self.integers else _no_tables(qps)
-        shared = lambda trees, own: lanes_of(trees if own else trees[:1])  # noqa: E731
+        tables = lanes_of(made, shared=not self.lanes) if self.integers else _no_tables(qps)
         parts = [
             self.layouts(),
-            shared(self.tunings, self.own.tuning),
-            shared(self._coefficients(), self.own.model),
-            shared(self._dv_coefficients(), self.own.model),
+            lanes_of(self.tunings, shared=not self.own.tuning),
+            lanes_of(self._coefficients(), shared=not self.own.model),
+            lanes_of(self._dv_coefficients(), shared=not self.own.model),
             qps,
             tables,
         ]
@@ -209,12 +209,27 @@ class Scenarios:
         some = {key: [getattr(self, key)[i] for i in index] for key in ("structures", "tunings", "models")}
         return dataclasses.replace(self, **some)
 
+    def ready_for(self, tunings: Sequence[Tuning], *, own: bool = False) -> Scenarios:
+        """The same scenarios for programs of a form that holds these tunings, too; `own`: with one per scenario."""
+        return dataclasses.replace(
+            self,
+            own=self.own._replace(tuning=self.own.tuning or own),
+            has_limits=self.has_limits or any(map(_limited, tunings)),
+            switching=self.switching or any(map(may_switch, tunings)),
+        )
+
+    def with_tunings(self, tunings: Sequence[Tuning]) -> Scenarios:
+        """The same scenarios with other tunings, one each, for programs of the same form if that holds them."""
+        pairs = [(s, id(t)) for s, t in zip(self.structures, tunings, strict=True)]
+        made = {key: within_values(key[0], t) for key, t in zip(pairs, tunings, strict=True)}
+        ready = self.ready_for(list(made.values()), own=len({id(t) for t in tunings}) > 1)
+        return dataclasses.replace(ready, tunings=[made[key] for key in pairs])
+
     def without(self, off: Bool[np.ndarray, "scenario cv"]) -> Scenarios:
-        """The same scenarios without the CVs that are switched off, in programs of the same form."""
+        """The same scenarios without the CVs that are switched off."""
         pairs = [(id(t), own.tobytes()) for t, own in zip(self.tunings, off, strict=True)]
         made = {key: without(t, own) for key, t, own in zip(pairs, self.tunings, off, strict=True)}
-        own = self.own._replace(tuning=self.lanes)
-        return dataclasses.replace(self, tunings=[made[key] for key in pairs], own=own)
+        return self.with_tunings([made[key] for key in pairs])
 
 
 def _no_tables(qps: Lanes[CondensedQp]) -> Lanes[Tables]:

@@ -7,10 +7,11 @@ integer MVs a step is pure, and may be used inside `jax.jit`, `jax.vmap` and `ja
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import jax
@@ -22,7 +23,7 @@ from jaxtyping import ArrayLike, Bool, Float
 from jaxmpc import status as codes
 from jaxmpc.controller.build import Scenarios
 from jaxmpc.controller.core import ControllerState, Core, Moment, StepInfo
-from jaxmpc.controller.sample import Sample, checked, checked_start
+from jaxmpc.controller.sample import Sample, checked, checked_off, checked_start
 from jaxmpc.errors import InputError
 from jaxmpc.integer.actuators import Actuator, actuators_of, samples_since
 from jaxmpc.integer.finish import finish_steps
@@ -48,7 +49,6 @@ class Relaxers:
 
     def __init__(self, scenarios: Scenarios, made: dict[int, Relaxer]):
         self.scenarios, self.made = scenarios, made
-        self._reduced: dict[bytes, Relaxers] = {}
 
     def __call__(self, envelope: int) -> Relaxer:
         """For integer ranges of so many steps."""
@@ -62,17 +62,6 @@ class Relaxers:
         return Relaxers(
             self.scenarios.part(index), {key: made.part(index) for key, made in self.made.items()}
         )
-
-    def without(self, off: Bool[np.ndarray, "scenario cv"]) -> Relaxers:
-        """The same without the CVs that are switched off."""
-        pattern = off.tobytes()
-        if not off.any():
-            return self
-        if pattern not in self._reduced:
-            self._reduced[pattern] = Relaxers(self.scenarios.without(off), {})
-            while len(self._reduced) > KEPT:
-                self._reduced.pop(next(iter(self._reduced)))
-        return self._reduced[pattern]
 
 
 @dataclasses.dataclass(eq=False)
@@ -92,6 +81,26 @@ class Batch:
         self.count, self.size = self.scenarios.count, self.scenarios.size
         self.structure, self.dv_names = self.scenarios.structures[0], self.scenarios.models[0].dv_names
         self._step = PackedCall(_stepped)
+        self._reduced: dict[bytes, Batch] = {}
+
+    def of(self, scenarios: Scenarios) -> Batch:
+        """The same controllers made of other scenarios; nothing is compiled where programs of the same form hold them."""
+        cores, relaxers = _built(scenarios)
+        cores = Lanes(*(old.of(new) for old, new in zip(_halves(self.cores), _halves(cores), strict=True)))
+        return Batch(
+            scenarios, cores, relaxers, self.gap, self.time_limit, self.finish, self.pace, self.decided
+        )
+
+    def without(self, off: Bool[np.ndarray, "scenario cv"]) -> Batch:
+        """The same without the CVs that are switched off."""
+        pattern = off.tobytes()
+        if not off.any():
+            return self
+        if pattern not in self._reduced:
+            self._reduced[pattern] = self.of(self.scenarios.without(off))
+            while len(self._reduced) > KEPT:
+                self._reduced.pop(next(iter(self._reduced)))
+        return self._reduced[pattern]
 
     def part(self, index: np.ndarray) -> Batch:
         """The controllers of some scenarios, which share what is computed already."""
@@ -149,13 +158,19 @@ class Batch:
         mv: Float[ArrayLike, "scenario mv"] | None = None,
         manual: Bool[ArrayLike, "scenario mv"] | None = None,
         dv: Float[ArrayLike, "scenario dv"] | Float[ArrayLike, "scenario horizon dv"] | None = None,
+        cv_off: Bool[ArrayLike, "scenario cv"] | None = None,
     ) -> tuple[ControllerState, StepInfo]:
         """One sample of all scenarios; arguments as in `Controller.step`, the scenario axis first."""
         own: dict[str, Any] = dict(dv_names=self.dv_names, lanes=self.count)
-        return self.decide(state, checked(self.structure, cv, setpoint, mv, manual, dv, **own))
+        off = checked_off(self.structure, cv_off, lanes=self.count)
+        return self.decide(state, checked(self.structure, cv, setpoint, mv, manual, dv, **own), off)
 
-    def decide(self, state: ControllerState, sample: Sample) -> tuple[ControllerState, StepInfo]:
-        """`step` of a checked sample."""
+    def decide(
+        self, state: ControllerState, sample: Sample, off: Bool[np.ndarray, "scenario cv"] | None = None
+    ) -> tuple[ControllerState, StepInfo]:
+        """`step` of a checked sample; `off`: CVs that somebody has switched off."""
+        if off is not None and off.any():
+            return self.without(off).decide(state, sample)
         clock = Clock()
         sample = self.over_register(sample)
         given = jax.tree.map(np.asarray, (state, sample, self.settings))
@@ -226,7 +241,7 @@ class Batch:
         """Of scenarios of one structure."""
         own: Moment = jax.tree.map(lambda leaf: np.asarray(leaf)[index], moment)
         structure = self.scenarios.structures[index[0]]
-        relaxers = self.relaxers.without(np.asarray(moment.state.sensors.off))
+        relaxers = self.without(np.asarray(moment.state.sensors.off)).relaxers
         try:
             with compiling_for(str(self.size)), in_time(self.time_limit):
                 return finish_steps(
@@ -281,12 +296,20 @@ class Controllers(Batch):
         some: Callable[[Any, type], Any] = lambda given, kind: [given] if isinstance(given, kind) else given  # noqa: E731
         given = some(structure, Structure), some(tunings, Tuning), some(models, StepResponseModel)
         scenarios = Scenarios.checked(*given, count)
-        with compiling_for(str(scenarios.size)):
-            qps = scenarios.problems(1)
-        constants = scenarios.constants(qps) if scenarios.integers else []
-        relaxers = Relaxers(scenarios, {1: Relaxer(qps, constants)} if scenarios.integers else {})
-        cores, pace = scenarios.core(qps, constants), pace_of(scenarios.size)
-        super().__init__(scenarios, cores, relaxers, *options, pace)
+        super().__init__(scenarios, *_built(scenarios), *options, pace_of(scenarios.size))
+
+
+def _built(scenarios: Scenarios) -> tuple[Lanes[Core], Relaxers]:
+    """What compiled programs know of controllers, and what searches on the host need."""
+    with compiling_for(str(scenarios.size)):
+        qps = scenarios.problems(1)
+    constants = scenarios.constants(qps) if scenarios.integers else []
+    relaxers = Relaxers(scenarios, {1: Relaxer(qps, constants)} if scenarios.integers else {})
+    return scenarios.core(qps, constants), relaxers
+
+
+def _halves(cores: Lanes[Core]) -> tuple[Core, Core]:
+    return cores.each, cores.shared
 
 
 def _actuators(structure: Structure, moment: Moment) -> list[list[Actuator]]:
@@ -385,9 +408,19 @@ class Controller:
         time_limit: float | None = None,
         finish: str = "auto",
     ):
-        self.lanes = Controllers(structure, tuning, model, gap=gap, time_limit=time_limit, finish=finish)
+        made = Controllers(structure, tuning, model, gap=gap, time_limit=time_limit, finish=finish)
+        self.lanes: Batch = made
         self.structure, self.tuning, self.model = structure, tuning, model
         self.gap, self.time_limit, self.finish = gap, time_limit, finish
+
+    def with_tuning(self, tuning: Tuning) -> Self:
+        """This controller with another tuning, for the states of this one.
+
+        It shares the compiled programs, unless the tuning is the first with a CV limit or a `bad_limit`.
+        """
+        other = copy.copy(self)
+        other.tuning, other.lanes = tuning, self.lanes.of(self.lanes.scenarios.with_tunings([tuning]))
+        return other
 
     @property
     def compiled(self) -> bool:
@@ -426,6 +459,7 @@ class Controller:
         mv: Float[ArrayLike, " mv"] | None = None,
         manual: Bool[ArrayLike, " mv"] | None = None,
         dv: Float[ArrayLike, " dv"] | Float[ArrayLike, "horizon dv"] | None = None,
+        cv_off: Bool[ArrayLike, " cv"] | None = None,
     ) -> tuple[ControllerState, StepInfo]:
         """One sample.
 
@@ -438,21 +472,23 @@ class Controller:
             mv: where the actuators stand before the move [MV unit], NaN where that is not known; without it, demands
                 count as followed.
             manual: MVs that somebody else moves; they are predicted from `mv` and not moved.
+            cv_off: CVs that somebody has switched off: without weights and limits, and predicted as ever.
 
         Raises:
             InputError: for other shapes, setpoints that are not finite, and where double precision is off.
             TypeError: for traced values where there are integer MVs, whose search may go on outside the program.
         """
         sample = checked(self.structure, cv, setpoint, mv, manual, dv, dv_names=self.model.dv_names)
+        off = checked_off(self.structure, cv_off)
+        with_lane = lambda tree: jax.tree.map(lambda leaf: leaf[None], tree)  # noqa: E731
         if not _traced(self.core, state, sample):
-            lane, of_lane = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (state, sample))
-            return self._shown(*one_lane(self.lanes.decide(lane, of_lane)))
+            lane, of_lane = with_lane(jax.tree.map(np.asarray, (state, sample)))
+            return self._shown(*one_lane(self.lanes.decide(lane, of_lane, off[None])))
         if self.structure.integer_mvs:
             raise TypeError("step() of a controller with integer MVs runs on the host and cannot be traced")
-        sample = jax.tree.map(
-            lambda v: v[0], self.lanes.over_register(jax.tree.map(lambda v: v[None], sample))
-        )
-        return self._shown(*self.core.conclude(self.core.consider(state, sample, self.gap)))
+        core = self.lanes.without(off[None]).cores.shared
+        sample = jax.tree.map(lambda v: v[0], self.lanes.over_register(with_lane(sample)))
+        return self._shown(*core.conclude(core.consider(state, sample, self.gap)))
 
     def _shown(self, state: ControllerState, info: StepInfo) -> tuple[ControllerState, StepInfo]:
         """The planned moves without padding."""

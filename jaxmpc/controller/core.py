@@ -135,6 +135,11 @@ class Core(eqx.Module):
     size: Size = eqx.field(static=True)  # of the arrays
     switching: bool = eqx.field(static=True)  # whether a CV may be switched off by bad measurements
 
+    def of(self, core: Core) -> Core:
+        """Another core, with what this one has besides the fields of every core."""
+        fields: dict[str, Any] = {field.name: getattr(core, field.name) for field in dataclasses.fields(Core)}
+        return dataclasses.replace(self, **fields)
+
     def init(
         self, cv: Float[Array, " cv"], mv: Float[Array, " mv"], dv: Float[Array, " dv"] | None = None
     ) -> ControllerState:
@@ -394,7 +399,7 @@ def outside_limits(tuning: Tuning, mv: Float[Array, " mv"]) -> Bool[Array, ""]:
     return jnp.any((mv < tuning.mv_low - drift) | (mv > tuning.mv_high + drift))
 
 
-def without(tuning: Tuning, off: Bool[Array, " cv"]) -> Tuning:
+def without(tuning: Tuning, off: Bool[Array, " cv"] | Bool[np.ndarray, " cv"]) -> Tuning:
     """The tuning without weights and limits of the CVs that are switched off; on the host if these are."""
     xp: Any = np if isinstance(off, np.ndarray) else jnp
     none = lambda values: xp.where(off, 0.0, values)  # noqa: E731

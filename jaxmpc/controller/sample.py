@@ -62,12 +62,7 @@ def checked(
         if mv is None
         else _array("mv", mv, structure.mv_names, "MV unit", lead + mvs)
     )
-    if manual is None:
-        manual = np.zeros(lead + mvs, dtype=bool)
-    elif not isinstance(manual, jax.Array):
-        manual = np.asarray(manual)
-    if manual.shape != lead + mvs or manual.dtype != np.bool_:
-        raise InputError("manual", _shown(manual), f"true or false for each of {_names(structure.mv_names)}")
+    manual = _flags("manual", manual, structure.mv_names, lead)
     return Sample(cv, setpoint, mv, manual, _disturbances(dv, dv_names, lead, horizon))
 
 
@@ -81,6 +76,32 @@ def _disturbances(given: Any, names: tuple[str, ...], lead: tuple, horizon: tupl
     dv = np.full(lead + now, np.nan) if given is None else given
     dv = _array("dv", dv, names, "DV unit", lead + now, lead + horizon + now)
     return dv[..., None, :] if dv.ndim == len(lead) + 1 else dv
+
+
+def checked_off(structure: Structure, given: ArrayLike | None, *, lanes: int | None = None) -> np.ndarray:
+    """CVs that are switched off, ``"cv"`` or ``"lane cv"``.
+
+    Raises:
+        InputError: naming the argument, for another shape, what is not true or false, and traced values: what a program is
+            made of is known before it runs.
+    """
+    off = _flags("cv_off", given, structure.cv_names, () if lanes is None else (lanes,))
+    if isinstance(off, Tracer):
+        raise InputError(
+            "cv_off", "a traced value", f"true or false for each of {_names(structure.cv_names)}"
+        )
+    return np.asarray(off)
+
+
+def _flags(path: str, given: Any, names: tuple[str, ...], lead: tuple[int, ...]) -> Any:
+    """True or false for each of some names; false if not given."""
+    if given is None:
+        given = np.zeros((*lead, len(names)), dtype=bool)
+    elif not isinstance(given, jax.Array):
+        given = np.asarray(given)
+    if given.shape != (*lead, len(names)) or given.dtype != np.bool_:
+        raise InputError(path, _shown(given), f"true or false for each of {_names(names)}")
+    return given
 
 
 def checked_start(

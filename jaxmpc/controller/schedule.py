@@ -27,10 +27,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxmpc.check import LARGEST, check_keys, is_count, is_number
-from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.build import Scenarios
+from jaxmpc.controller.controller import Batch, Controller
 from jaxmpc.controller.core import ControllerState, Core, Moment, StepInfo
 from jaxmpc.controller.sample import Sample
 from jaxmpc.errors import InputError
@@ -269,7 +270,7 @@ class _Table:
         kept: controllers kept; the one used least recently goes first.
     """
 
-    def __init__(self, controllers: Controllers, schedule: ModelSchedule, spacing: float | None, kept: int):
+    def __init__(self, controllers: Batch, schedule: ModelSchedule, spacing: float | None, kept: int):
         if spacing is not None and not (is_number(spacing) and spacing > 0):
             raise InputError("spacing", spacing, "a positive distance of models in the table [MV unit]")
         if not is_count(kept):
@@ -281,34 +282,39 @@ class _Table:
         apart = [_apart(step or spacing, v) for step, v in zip(steps, schedule.grid, strict=True)]
         self.places, self.grid = schedule.places, np.array(apart)
         self.built = 0  # controllers made so far
-        self._table: collections.OrderedDict[tuple[float, ...], Controllers] = collections.OrderedDict()
+        self._table: collections.OrderedDict[tuple[float, ...], Batch] = collections.OrderedDict()
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the table, which is made again when needed."""
         return self.__dict__ | {"_table": collections.OrderedDict()}
 
-    def at(self, mv) -> Controllers:
+    def of(self, scenarios: Scenarios) -> _Table:
+        """As `Batch.of`, with nothing in it yet."""
+        return _Table(self.reference.of(scenarios), self.schedule, self.spacing, self.kept)
+
+    def at(self, mv) -> Batch:
         """The controller for the MVs [MV unit], rounded to the table."""
         rounded = np.array(mv, dtype=np.float64)
         rounded[self.places] = np.round(rounded[self.places] / self.grid) * self.grid
         point = tuple(rounded[self.places].tolist())
         if point not in self._table:
-            own, model = self.reference, self.schedule.model_at(rounded)
-            options: dict[str, Any] = dict(gap=own.gap, time_limit=own.time_limit, finish=own.finish)
-            self._table[point] = Controllers(self.structure, own.scenarios.tunings, model, **options)
+            there = dataclasses.replace(self.scenarios, models=[self.schedule.model_at(rounded)])
+            self._table[point] = self.reference.of(there)
             self.built += 1
             if len(self._table) > self.kept:
                 self._table.popitem(last=False)
         self._table.move_to_end(point)
         return self._table[point]
 
-    def decide(self, state: ControllerState, sample: Sample) -> tuple[ControllerState, StepInfo]:
+    def decide(
+        self, state: ControllerState, sample: Sample, off: Bool[np.ndarray, "scenario cv"] | None = None
+    ) -> tuple[ControllerState, StepInfo]:
         """One sample. Its time includes the making of a controller."""
         clock = Clock()
         before = np.where(np.isfinite(sample.mv[0]), sample.mv[0], np.asarray(state.mv)[0])
         controllers = self.at(before)
         made = clock.seconds
-        state, info = controllers.decide(state, sample)
+        state, info = controllers.decide(state, sample, off)
         clock = Clock()
         # moves of the others are too small to matter
         if np.any(info.move[0, list(self.structure.integer_mvs)]):

@@ -20,7 +20,7 @@ from jaxtyping import ArrayLike, Bool, Float
 from jaxmpc.check import is_number
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.core import ControllerState, StepInfo
-from jaxmpc.controller.sample import checked, checked_start
+from jaxmpc.controller.sample import checked, checked_off, checked_start
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure, check_match
@@ -139,6 +139,7 @@ class TargetController:
         mv: Float[ArrayLike, " mv"] | None = None,
         manual: Bool[ArrayLike, " mv"] | None = None,
         dv: Float[ArrayLike, " dv"] | Float[ArrayLike, "horizon dv"] | None = None,
+        cv_off: Bool[ArrayLike, " cv"] | None = None,
     ) -> tuple[ControllerState, StepInfo]:
         """One sample; the objective in the info is J + J_u (6.20).
 
@@ -146,14 +147,15 @@ class TargetController:
             cv: measurement now, without the further CVs [CV unit].
             setpoint: at j = 1..Hp, or held over the horizon [CV unit].
             mv_target: held over the horizon [MV unit]; entries of MVs without a target are not looked at.
-            mv, manual, dv: as in `Controller.step`.
+            mv, manual, dv, cv_off: as in `Controller.step`.
         """
         given = checked(self.structure, cv, setpoint, mv, manual)
         self._check_targets(mv_target)
         xp = _module(given.cv, given.mv, state.position)
         stands = xp.where(given.mv == given.mv, given.mv, state.position)
         wide = self._with(given.cv, stands), self._with(given.setpoint, mv_target)
-        return self.controller.step(state, *wide, given.mv, given.manual, dv)
+        off = np.append(checked_off(self.structure, cv_off), np.zeros(len(self.targeted), dtype=bool))
+        return self.controller.step(state, *wide, given.mv, given.manual, dv, off)
 
     def _check_targets(self, mv_target: Any) -> None:
         """Refuse targets of another shape, and those that are not finite where they are looked at."""

@@ -1,7 +1,8 @@
 """Closed loops on plants in JAX, many samples in one compiled call: one lane, or many on several cores or devices.
 
 Decision, plant and next sample stay on the device until a sample is met whose whole moves have to be decided on the host.
-One call carries out what was decided there and goes on. `loop.simulate` is the only caller.
+One call carries out what was decided there and goes on. A call ends before the sample of an event, and the next one has the
+changed controllers. `loop.simulate` is the only caller.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from jaxmpc.controller.controller import Batch, considered
 from jaxmpc.controller.core import Moment
 from jaxmpc.controller.measurement import received
 from jaxmpc.controller.sample import Sample
+from jaxmpc.loop.events import Course, Stage
 from jaxmpc.programs.clock import Clock
 from jaxmpc.programs.compilation import compiling_for
 from jaxmpc.programs.lanes import Lanes
@@ -68,6 +70,7 @@ def simulate_compiled(
     inputs: Inputs,
     record: Collection[str],
     *,
+    stages: Sequence[Sequence[Stage]] = (),
     real: int | None = None,
     devices: Sequence[Any] = (),
     progress: Callable[[int], None] | None = None,
@@ -77,6 +80,7 @@ def simulate_compiled(
     The samples of a call share its time by the steps of their solves; what the host does is charged to its sample.
 
     Args:
+        stages: of every scenario, where there are events; the controllers are in the first.
         real: number of scenarios that count, the others are copies; all if not given.
         devices: to spread the scenarios over; the default one if not given.
         progress: told how many samples of all scenarios were done, first when everything is compiled; by one thread at a
@@ -87,8 +91,17 @@ def simulate_compiled(
     most = TOGETHER if len(devices) < 2 else -(-count // len(devices))
     parts = parts_of(count, most, cut=len(devices) > 1)
     places = [devices[k % len(devices)] if len(devices) > 1 else None for k in range(len(parts))]
+    held = any(stage.manual.any() for each in stages for stage in each)
     runs = [
-        _Run(controllers.part(part), plants.take(part), inputs.part(part), record, place)
+        _Run(
+            controllers.part(part),
+            plants.take(part),
+            inputs.part(part),
+            record,
+            place,
+            [stages[k] for k in part] if stages else [],
+            held,
+        )
         for part, place in zip(parts, places, strict=True)
     ]
     with compiling_for(f"loops of {controllers.size}"):
@@ -116,9 +129,17 @@ class _Run:
     """Loops under way, of scenarios that share every call; arguments as in `simulate_compiled`."""
 
     def __init__(
-        self, controllers: Batch, plants: Lanes, inputs: Inputs, record: Collection[str], place: Any
+        self,
+        controllers: Batch,
+        plants: Lanes,
+        inputs: Inputs,
+        record: Collection[str],
+        place: Any,
+        stages: Sequence[Sequence[Stage]],
+        held: bool,
     ):
-        self.controllers, self.plants, self.record, self.place = controllers, plants, record, place
+        self.course, self.held = Course(controllers, stages), held  # `held`: whether an MV is in any run
+        self.plants, self.record, self.place = plants, record, place
         self.count, self.samples = controllers.count, inputs.setpoints.shape[1]
         outside = [inputs.setpoints, inputs.errors, inputs.faults, inputs.dv, inputs.disturbance]
         together = np.concatenate(outside, axis=2)
@@ -127,9 +148,14 @@ class _Run:
         )  # samples that a call is told
         # beyond the end the last sample is repeated
         self.inputs = np.concatenate([together, np.repeat(together[:, -1:], self.window, axis=1)], axis=1)
-        leaves, self.form = flattened((controllers.cores, plants))
-        self.leaves = leaves if place is None else jax.device_put(leaves, place)
-        self.told = inputs.told.astype(float)
+        self.told = inputs.told.astype(float)[:, None]
+        self._take()
+
+    def _take(self) -> None:
+        """Go on with the controllers of the course."""
+        self.controllers = self.course.controllers
+        leaves, self.form = flattened((self.controllers.cores, self.plants))
+        self.leaves = leaves if self.place is None else jax.device_put(leaves, self.place)
 
     def start(self) -> Any:
         """The packed `Now` before the first sample."""
@@ -168,7 +194,9 @@ class _Run:
             ``(packed, seen, done, count, decided)``: the sample measured last, fields of what was measured since and of what
             was carried out, how many samples were measured, and whether all scenarios of the last one are decided.
         """
-        settings = np.concatenate([self.controllers.settings, self.told[:, None]], axis=1)
+        # without an MV that is held in any run, programs know of none
+        manual = self.course.manual if self.held else np.zeros((self.count, 0))
+        settings = np.concatenate([self.controllers.settings, self.told, manual], axis=1)
         given = (packed, self.inputs[:, begin : begin + self.window], settings)
         given = given if self.place is None else jax.device_put(given, self.place)
         packed, rows, (count, decided) = _stride(self.leaves, *given, most, self.form, self.of_now)
@@ -182,10 +210,12 @@ class _Run:
         fields: dict[str, np.ndarray] = {}
         done = acted = 0  # only the first call has nothing to carry out
         while done < self.samples and not stopped():
+            if self.course.enter(done + acted):
+                self._take()
             clock = Clock()
             # the sample after the last is measured, too: nothing else is carried out at the end
-            most = min(self.samples - done + 1 - acted, LONGEST)
-            packed, seen, doings, count, decided = self.stride(packed, done, most)
+            most = int(min(self.course.next, self.samples + 1)) - done - acted
+            packed, seen, doings, count, decided = self.stride(packed, done, min(most, LONGEST))
             seconds = clock.seconds
             # the first row of what was seen is the sample after the one that was carried out first
             first, carried, acted = done + acted, count - 1 + acted, 1
@@ -240,7 +270,8 @@ def _stride(leaves, packed, inputs, settings, most, form, of_now: Packing):
     cvs, future, dvs = now.cv.shape[1], now.moment.free_response.shape[1], cores.value.size.dvs
     setpoints, errors, faults = (inputs[..., k * cvs : (k + 1) * cvs] for k in range(3))
     known, disturbance = inputs[..., 3 * cvs : 3 * cvs + dvs], inputs[..., 3 * cvs + dvs :]
-    told, preview = settings[:, 3:] > 0, inputs.shape[1] > LONGEST + 1
+    told, preview = settings[:, 3:4] > 0, inputs.shape[1] > LONGEST + 1
+    none_held = settings.shape[1] == 4
     late = now.decided[0].astype(int)  # measured is sample `late`, then late + 1, ...
 
     def carry_out(now: Now, at) -> tuple[Now, dict[str, Array]]:
@@ -269,7 +300,7 @@ def _stride(leaves, packed, inputs, settings, most, form, of_now: Packing):
                 ahead(setpoints, at + 1 if preview else at, future), (now.cv.shape[0], future, cvs)
             ),
             mv=jnp.where(told, now.mv, jnp.nan),
-            manual=jnp.zeros(now.mv.shape, dtype=bool),
+            manual=jnp.zeros(now.mv.shape, dtype=bool) if none_held else settings[:, 4:] > 0,
             dv=ahead(known, at, future) if dvs else None,
         )
         moment = considered(cores, before, sample, settings[:, :3])

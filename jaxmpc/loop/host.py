@@ -1,4 +1,4 @@
-"""A closed loop that asks the host at every sample: for plants outside JAX, controllers that take over, plans carried out.
+"""A closed loop that asks the host at every sample: for plants outside JAX, and plans that are carried out.
 
 `loop.simulate` is the only caller.
 """
@@ -8,68 +8,57 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.core import ControllerState, StepInfo
 from jaxmpc.controller.measurement import received
 from jaxmpc.controller.sample import Sample
 from jaxmpc.loop.compiled import Inputs
-from jaxmpc.loop.interventions import CarriedOut, handed_over
+from jaxmpc.loop.events import Course, Stage
+from jaxmpc.loop.interventions import CarriedOut
 
 REPORT = 20  # samples between two progress reports
 
 
 def simulate_on_host(
+    controllers: Any,
     plant: Any,
     inputs: Inputs,
-    takeovers: dict[int, Controller],
+    stages: Sequence[Sequence[Stage]],
     blind: int | None,
     progress: Callable[[int, int], None] | None,
 ) -> dict[str, np.ndarray]:
     """One closed loop; fields of `Trajectory`.
 
     Args:
-        takeovers: controllers by the first sample that they decide.
+        controllers: a single one that steps like `Batch`, in its first stage.
+        stages: as of `simulate_compiled`.
         blind: sample whose plan is carried out without feedback; None for none.
         progress: called with ``(done, total)`` samples.
     """
-    setpoints, offsets, errors, faults = (v[0] for v in inputs[:4])
-    told, total, named = bool(inputs.told[0]), len(setpoints), hasattr(plant, "disturbance_names")
-    future = takeovers[0].lanes.size.future if inputs.preview else 1
-    beyond = lambda v: np.concatenate([v, np.repeat(v[-1:], future, axis=0)])  # noqa: E731
-    references, dvs = beyond(setpoints), beyond(inputs.dv[0])
-    ahead = int(inputs.preview)  # the setpoint of the sample itself where no other is told
-    outputs = plant.init()
+    offsets, errors, faults = inputs.disturbance[0], inputs.errors[0], inputs.faults[0]
+    total, named = len(offsets), hasattr(plant, "disturbance_names")
+    outputs, course, told = plant.init(), Course(controllers, stages), Told(inputs, controllers.size.future)
     now, mv = np.asarray(outputs.cv), np.asarray(outputs.mv)
-    states: dict[int, ControllerState] = {}
-    for k, one in takeovers.items():
-        states[k] = one.lanes.init(now[None], mv[None])
-        unknown = np.full_like(mv, np.nan)
-        one.lanes.decide(
-            states[k], _sample(now, now[None], unknown, dvs[:1])
-        )  # compile before the clock starts
-    controller, state = takeovers[0], states[0]
+    state = controllers.init(now[None], mv[None])
+    controllers.decide(
+        state, told.sample(0, now[None], mv[None], course.manual)
+    )  # compile before the clock starts
     records: list[dict[str, Any]] = []
     carried = None
     with undisturbed():
         for k in range(total):
             cv = np.asarray(outputs.cv) + errors[k]
-            if k in takeovers:
-                controller, state = takeovers[k], handed_over(state, states[k])
+            course.enter(k)
             if carried is None or blind is None:
                 arrived = received(cv, faults[k], np.asarray(state.sensors.value)[0])
-                stands = np.asarray(outputs.mv)
-                stands = stands if told else np.full_like(stands, np.nan)
-                sample = _sample(
-                    arrived, references[k + ahead : k + ahead + future], stands, dvs[k : k + future]
-                )
-                state, info = controller.lanes.decide(state, sample)
+                sample = told.sample(k, arrived[None], np.asarray(outputs.mv)[None], course.manual)
+                state, info = course.controllers.decide(state, sample)
                 record = {name: value[0] for name, value in recorded(cv[None], state, info).items()}
-                carried = CarriedOut(controller.structure, record) if k == blind else None
+                carried = CarriedOut(controllers.structure, record) if k == blind else None
             else:
                 record = carried.record(k - blind, cv)
             outputs = plant.step(record["mv_demand"], offsets[k] if named else float(offsets[k, 0]))
@@ -79,10 +68,32 @@ def simulate_on_host(
     return {name: np.stack([record[name] for record in records]) for name in records[0]}
 
 
-def _sample(cv: np.ndarray, setpoint: np.ndarray, mv: np.ndarray, dv: np.ndarray) -> Sample:
-    """Of one lane, with its axis."""
-    known = dv[None] if dv.size else None
-    return Sample(cv[None], setpoint[None], mv[None], np.zeros((1, len(mv)), dtype=bool), known)
+class Told:
+    """What controllers are told at a sample, all arrays with a lane axis.
+
+    Args:
+        future: samples of the shift register, which a preview covers; beyond the end of the run the last sample is repeated.
+    """
+
+    def __init__(self, inputs: Inputs, future: int):
+        self.preview, self.positions = inputs.preview, inputs.told[:, None]
+        self.rows = rows = future if inputs.preview else 1
+        beyond = lambda v: np.concatenate([v, np.repeat(v[:, -1:], rows, axis=1)], axis=1)  # noqa: E731
+        self.setpoints, self.dv = beyond(inputs.setpoints), beyond(inputs.dv)
+
+    def sample(self, k: int, cv: np.ndarray, mv: np.ndarray, manual: np.ndarray, gone: Any = False) -> Sample:
+        """Sample k.
+
+        Args:
+            cv: what arrived [CV unit].
+            mv: where the actuators stand, told to lanes with position feedback [MV unit].
+            manual: MVs that are held.
+            gone: MVs of no plant, which are held where they stood.
+        """
+        first = k + 1 if self.preview else k  # the setpoint of the sample itself where no other is told
+        dv = self.dv[:, k : k + self.rows] if self.dv.size else None
+        stands = np.where(self.positions | gone, mv, np.nan)
+        return Sample(cv, self.setpoints[:, first : first + self.rows], stands, manual | gone, dv)
 
 
 def recorded(cv: np.ndarray, state: ControllerState, info: StepInfo) -> dict[str, np.ndarray]:

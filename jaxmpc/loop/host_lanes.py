@@ -16,10 +16,10 @@ import numpy as np
 from jaxmpc import status
 from jaxmpc.controller.controller import Batch
 from jaxmpc.controller.measurement import MISSING, received
-from jaxmpc.controller.sample import Sample
 from jaxmpc.errors import PlantError
 from jaxmpc.loop.compiled import Inputs
-from jaxmpc.loop.host import recorded, undisturbed
+from jaxmpc.loop.events import Course, Stage
+from jaxmpc.loop.host import Told, recorded, undisturbed
 from jaxmpc.process.plant import StatefulPlant
 from jaxmpc.programs.compilation import compiling_for
 from jaxmpc.programs.threads import parts_of, side_by_side
@@ -33,6 +33,7 @@ def simulate_host_lanes(
     plants: Sequence[StatefulPlant],
     inputs: Inputs,
     progress: Callable[[int], None] | None = None,
+    stages: Sequence[Sequence[Stage]] = (),
 ) -> tuple[dict[str, np.ndarray], dict[int, PlantError]]:
     """Closed loops of controllers and plants, one of each per lane; plants are closed when their loop is over.
 
@@ -42,13 +43,17 @@ def simulate_host_lanes(
     Args:
         plants: whose processes start with `init`, so that no more of them run than are needed (`FmuPlant.replaced`).
         progress: told how many samples of all lanes were done, by one thread at a time.
+        stages: as of `simulate_compiled`.
 
     Returns:
         ``(fields, failures)``: fields of `Trajectory`, ``"lane sample ..."``, and what ended a lane, by its number.
     """
     lock, count, failures = threading.Lock(), len(plants), {}
     parts = parts_of(count, TOGETHER, cut=True)
-    runs = [_Run(controllers.part(part), inputs.part(part)) for part in parts]
+    runs = [
+        _Run(controllers.part(part), inputs.part(part), [stages[k] for k in part] if stages else [])
+        for part in parts
+    ]
     with compiling_for(f"loops of {controllers.size}"):
         runs[0].compile()
 
@@ -74,8 +79,9 @@ def simulate_host_lanes(
 class _Run:
     """Loops under way, of lanes that decide together."""
 
-    def __init__(self, controllers: Batch, inputs: Inputs):
-        self.controllers, self.inputs = controllers, inputs
+    def __init__(self, controllers: Batch, inputs: Inputs, stages: Sequence[Sequence[Stage]]):
+        self.course, self.inputs = Course(controllers, stages), inputs
+        self.told = Told(inputs, controllers.size.future)
         structure, count = controllers.structure, controllers.count
         # where a lane has no plant (any more) its MVs are somebody else's: there is nothing to decide
         self.alive = np.zeros(count, dtype=bool)
@@ -84,7 +90,7 @@ class _Run:
 
     def compile(self) -> None:
         """Before the clock starts."""
-        self._decide(self.controllers.init(self.cv, self.mv), self.cv, 0)
+        self._decide(self.course.controllers.init(self.cv, self.mv), self.cv, 0)
 
     def advanced(
         self, plants: Sequence[Any], tick: Callable[[int], None], stopped: Callable[[], bool]
@@ -101,13 +107,14 @@ class _Run:
         return {name: np.stack([r[name] for r in records], axis=1) for name in records[0]}, self.failed
 
     def _samples(self, plants, tick, stopped) -> list[dict[str, np.ndarray]]:
-        _, offsets, errors, faults, *_ = self.inputs
-        state, records = self.controllers.init(self.cv, self.mv), []
+        offsets, errors, faults = self.inputs.disturbance, self.inputs.errors, self.inputs.faults
+        state, records = self.course.controllers.init(self.cv, self.mv), []
         named = [hasattr(plant, "disturbance_names") for plant in plants]
-        for k in range(errors.shape[1]):
+        for k in range(offsets.shape[1]):
             measured = self.alive.copy()
             cv = np.where(measured[:, None], self.cv + errors[:, k], np.nan)
             arrived = received(cv, faults[:, k], np.asarray(state.sensors.value))
+            self.course.enter(k)
             state, info = self._decide(state, arrived, k)
             record = recorded(cv, state, info)
             demand = record["mv_demand"]
@@ -125,14 +132,9 @@ class _Run:
         return records
 
     def _decide(self, state, arrived: np.ndarray, k: int):
-        """What is done at sample k; beyond the end of the run setpoints and disturbances stay as they are."""
         gone = np.repeat(~self.alive[:, None], self.mv.shape[1], axis=1)
-        stands = np.where(self.inputs.told[:, None] | gone, self.mv, np.nan)
-        total, ahead = self.inputs.setpoints.shape[1], self.inputs.preview
-        rows = np.minimum(k + np.arange(self.controllers.size.future if ahead else 1), total - 1)
-        setpoint = self.inputs.setpoints[:, np.minimum(rows + ahead, total - 1)]
-        dv = self.inputs.dv[:, rows] if self.inputs.dv.size else None
-        return self.controllers.decide(state, Sample(arrived, setpoint, stands, gone, dv))
+        sample = self.told.sample(k, arrived, self.mv, self.course.manual, gone)
+        return self.course.controllers.decide(state, sample)
 
     def _each(self, plants: Sequence[Any], act: Callable[[int, Any], Any]) -> None:
         """Do something with the plant of every lane that has one, and keep what it measures."""

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from jaxmpc.controller.controller import Batch
 from jaxmpc.errors import InputError
 from jaxmpc.loop.compiled import Inputs
+from jaxmpc.loop.events import Stage, has_lanes, staged
 from jaxmpc.loop.noise import check_deviation, check_seed, errors_of
 from jaxmpc.problem.structure import Structure
-from jaxmpc.process.plant import JaxPlant, disturbances_of
+from jaxmpc.process.plant import JaxPlant, StatefulPlant, disturbances_of
 from jaxmpc.process.reference import Reference
 from jaxmpc.programs.lanes import Lanes, for_all
 
@@ -25,13 +27,14 @@ class Sweep:
     """All lanes of a sweep on the host, checked."""
 
     controllers: Batch
-    plants: Lanes[JaxPlant]
+    plants: Lanes[JaxPlant] | Sequence[StatefulPlant]
     setpoints: Sequence[np.ndarray]  # one for all, or one per lane
     offsets: np.ndarray  # "sample disturbance" or "lane sample disturbance"
     deviation: np.ndarray  # "lane cv"
     seeds: np.ndarray  # "lane 2": seed and stream
     faults: np.ndarray  # "sample cv" or "lane sample cv"
     position_feedback: np.ndarray  # "lane"
+    stages: list[list[Stage]]  # of every controller; empty without events
     measured: list[int]  # which of the disturbances the controllers are told
     preview: bool
     samples: int
@@ -49,20 +52,27 @@ class Sweep:
         plants,
         reference,
         *,
-        samples,
-        disturbance,
-        noise,
-        seed,
-        faults,
-        position_feedback,
-        preview,
+        samples=None,
+        disturbance=None,
+        noise=None,
+        seed: Any = 0,
+        faults=None,
+        position_feedback: Any = False,
+        preview: Any = False,
+        events=(),
     ) -> Sweep:
         """The sweep, or an `InputError` that names what does not fit."""
-        plants = plants if isinstance(plants, Lanes) else for_all(plants)
+        if isinstance(plants, (list, tuple)):
+            if not plants:
+                raise InputError("plants", [], "one or more, one per lane")
+            first, own_plants = plants[0], len(plants)
+        else:
+            plants = plants if isinstance(plants, Lanes) else for_all(plants)
+            first, own_plants = plants.shared, plants.count
         structure = controllers.structure
-        if abs(plants.shared.dt - structure.dt) > 1e-9 * structure.dt:
+        if abs(first.dt - structure.dt) > 1e-9 * structure.dt:
             expected = f"the controller's sampling interval {structure.dt} s"
-            raise InputError("plant.dt", plants.shared.dt, expected)
+            raise InputError("plant.dt", first.dt, expected)
         own_references = not isinstance(reference, Reference)
         references = list(reference) if own_references else [reference]
         if samples is None and references:
@@ -73,7 +83,7 @@ class Sweep:
                 raise InputError("reference.setpoints", f"{r.cv_count} columns", expected)
         known = {r: r.sample(structure.dt, samples) for r in dict.fromkeys(references)}
         setpoints = [known[r] for r in references]
-        names, shape = disturbances_of(plants.shared), (samples or 0, structure.cv_count)
+        names, shape = disturbances_of(first), (samples or 0, structure.cv_count)
         for name in controllers.dv_names:
             if name not in names:
                 raise InputError("model.dv", name, f"one of the plant's disturbances, {list(names)}")
@@ -95,13 +105,14 @@ class Sweep:
             "controllers": controllers.count
             if controllers.count > 1 or controllers.scenarios.lanes
             else None,
-            "plants": plants.count,
+            "plants": own_plants,
             "reference": len(references) if own_references else None,
             "disturbance": len(offsets) if offsets.ndim == 3 else None,
             "noise": len(deviation) if deviation.ndim == 2 else None,
             "seed": len(seed) if seed.ndim else None,
             "faults": len(failing) if failing.ndim == 3 else None,
             "position_feedback": len(told) if told.ndim else None,
+            "events": len(events) if has_lanes(events) else None,
         }
         given = {name: count for name, count in counts.items() if count is not None}
         if len(set(given.values())) != 1 or not min(given.values()):
@@ -123,6 +134,9 @@ class Sweep:
         if failing.shape not in shapes:
             expected = " or ".join(str(list(s)) for s in shapes) + " errors, one per sample and CV"
             raise InputError("faults", f"shape {list(failing.shape)}", expected)
+        stages = []
+        if events:
+            controllers, stages = staged(controllers, events, count, len(setpoints[0]))
         stream = np.arange(count) if seed.ndim == 0 else np.zeros(count)
         return cls(
             controllers=controllers,
@@ -133,6 +147,7 @@ class Sweep:
             seeds=np.stack([np.broadcast_to(seed, count), stream], axis=1).astype(np.int64),
             faults=failing,
             position_feedback=np.broadcast_to(told, count),
+            stages=stages,
             measured=[names.index(name) for name in controllers.dv_names],
             preview=bool(preview),
             samples=len(setpoints[0]),
@@ -144,6 +159,12 @@ class Sweep:
         if self.controllers.count == 1:
             return self.controllers.repeated(len(index))
         return self.controllers.part(index)
+
+    def stages_of(self, index: np.ndarray) -> list[list[Stage]]:
+        """What holds from which sample on in some lanes; nothing without events."""
+        if len(self.stages) == 1:
+            return self.stages * len(index)
+        return [self.stages[k] for k in index] if self.stages else []
 
     def inputs_of(self, index: np.ndarray) -> Inputs:
         """What comes from outside, of some lanes."""

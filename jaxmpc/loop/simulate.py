@@ -1,7 +1,7 @@
 """Closed loops (thesis chapter 7): a controller, a plant and a reference make a `Trajectory`.
 
 On a plant in JAX many samples run in one compiled call, and `simulate_batches` runs many loops side by side, some lanes and
-some samples at a time. Everything else (the FMU, controllers that take over) steps on the host with the very same programs.
+some samples at a time. Everything else (the FMU, plans that are carried out) steps on the host with the very same programs.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ from numpy.typing import ArrayLike
 from jaxmpc.controller.controller import Batch, Controller, Controllers
 from jaxmpc.errors import InputError
 from jaxmpc.loop.compiled import Inputs, simulate_compiled
+from jaxmpc.loop.events import Event
 from jaxmpc.loop.host import simulate_on_host
+from jaxmpc.loop.host_lanes import simulate_host_lanes
 from jaxmpc.loop.inputs import Sweep
-from jaxmpc.loop.interventions import checked_changes, checked_sample
+from jaxmpc.loop.interventions import checked_sample
 from jaxmpc.loop.trajectory import RECORDABLE, Trajectory, TrajectoryBatch
 from jaxmpc.problem.structure import Structure
 from jaxmpc.process.host import HostPlant
@@ -43,7 +45,7 @@ def simulate(
     faults: Float[ArrayLike, "sample cv"] | None = None,
     position_feedback: bool = False,
     preview: bool = False,
-    changes: Sequence[tuple[float, Controller]] = (),
+    events: Sequence[Event] = (),
     open_loop_from: float | None = None,
     keep_plans: bool = False,
     progress: Progress | None = None,
@@ -61,7 +63,7 @@ def simulate(
         position_feedback: whether the controller is told where the actuators stand, and predicts from there.
         preview: whether it is told the setpoints and the measured disturbances of the whole horizon; beyond the end of
             the run they stay as they are.
-        changes: times [s] and controllers of equal structure that take over then, with the state of the one before.
+        events: changes of the controller during the run, in order of time.
         open_loop_from: from the plan made at this time [s] on, no measurement is used and nothing is solved: the plan is
             carried out to its end, then the MVs are held. Status, bias and objective stay those of the plan.
         keep_plans: whether `Trajectory.plan` has the planned moves of every sample.
@@ -73,7 +75,7 @@ def simulate(
     Raises:
         InputError: if sampling intervals differ, the reference has other CVs or ends before the run, the disturbance
             has not one finite value per sample and name, the noise not one standard deviation per CV, the faults not one
-            error per sample and CV, the plant lacks a DV of the model, or a change does not fit.
+            error per sample and CV, the plant lacks a DV of the model, or an event does not fit.
     """
     structure = controller.structure
     if (noise is not None and np.ndim(noise) > 1) or np.ndim(seed):
@@ -89,24 +91,24 @@ def simulate(
         faults=faults,
         position_feedback=bool(position_feedback),
         preview=preview,
+        events=events,
     )
-    setpoints, inputs = run.setpoints[0], run.inputs_of(np.arange(1))
-    takeovers, blind = checked_changes(controller, changes, len(setpoints)), None
+    setpoints, inputs, stages, blind = run.setpoints[0], run.inputs_of(np.arange(1)), run.stages, None
     if open_loop_from is not None:
         blind = checked_sample("open_loop_from", open_loop_from, structure, len(setpoints))
-        if takeovers and max(takeovers) > blind:
-            raise InputError("open_loop_from", open_loop_from, "a time after the last of changes")
-    if isinstance(plant, JaxPlant) and not takeovers and blind is None and controller.compiled:
-        record = _one_lane(controller.lanes, plant, inputs, (*RECORDABLE, "plan"), progress)
+        if stages and stages[0][-1].first > blind:
+            raise InputError("open_loop_from", open_loop_from, "a time not before the last of events [s]")
+    if isinstance(plant, JaxPlant) and blind is None and controller.compiled:
+        record = _one_lane(run.controllers, plant, inputs, stages, (*RECORDABLE, "plan"), progress)
     else:
         host = HostPlant(plant) if isinstance(plant, JaxPlant) else plant
-        record = simulate_on_host(host, inputs, {0: controller, **takeovers}, blind, progress)
+        record = simulate_on_host(run.controllers, host, inputs, stages, blind, progress)
     plan = record.pop("plan")[:, : structure.block_count]
     kept = {"plan": plan} if keep_plans else {}
     return Trajectory(setpoint=setpoints, **record, **kept, **_labels(structure, len(setpoints)))
 
 
-def _one_lane(controllers: Batch, plant, inputs: Inputs, record, progress: Progress | None):
+def _one_lane(controllers: Batch, plant, inputs: Inputs, stages, record, progress: Progress | None):
     """A compiled loop of one controller."""
     done, total = 0, inputs.setpoints.shape[1]
 
@@ -116,7 +118,7 @@ def _one_lane(controllers: Batch, plant, inputs: Inputs, record, progress: Progr
         if progress is not None and done:
             progress(done, total)
 
-    fields = simulate_compiled(controllers, for_all(plant), inputs, record, progress=tick)
+    fields = simulate_compiled(controllers, for_all(plant), inputs, record, stages=stages, progress=tick)
     return {name: values[0] for name, values in fields.items()}
 
 
@@ -145,7 +147,7 @@ def simulate_batch(*arguments: Any, **options: Any) -> list[Trajectory]:
 
 def simulate_batches(
     controllers: Controllers | Controller,
-    plants: Lanes[JaxPlant] | JaxPlant,
+    plants: Lanes[JaxPlant] | JaxPlant | Sequence[StatefulPlant],
     reference: Reference | Sequence[Reference],
     *,
     samples: int | None = None,
@@ -155,12 +157,13 @@ def simulate_batches(
     faults: Float[ArrayLike, "*lane sample cv"] | None = None,
     position_feedback: ArrayLike = False,
     preview: bool = False,
+    events: Sequence[Event] | Sequence[Sequence[Event]] = (),
     record: Sequence[str] = RECORDABLE,
     lanes_at_once: int = LANES,
     devices: Sequence[Any] | None = None,
     progress: Progress | None = None,
 ) -> Iterator[TrajectoryBatch]:
-    """Closed loops on plants in JAX, `lanes_at_once` side by side in one compiled program, piece by piece.
+    """Closed loops on plants in JAX, `lanes_at_once` side by side in one compiled program, piece by piece; or on the host.
 
     What is given once is shared by all lanes; anything may have one value per lane instead. A piece is complete in
     time; when the next one is asked for, nothing of it is kept here, so that memory does not grow with the sweep.
@@ -168,7 +171,8 @@ def simulate_batches(
 
     Args:
         controllers: one for all, or one per lane.
-        plants: one, or `Lanes` of them (`lanes.per_lane`).
+        plants: one, or `Lanes` of them (`lanes.per_lane`); or a list of plants that keep their own state, one per lane,
+            which are closed at the end. One that fails ends its own lane (`loop.host_lanes`).
         reference: setpoints for all, or a list with one reference per lane.
         samples: length of the runs; the whole (shortest) reference if not given.
         disturbance: ``"sample disturbance"`` or ``"lane sample disturbance"``, as in `simulate`.
@@ -180,6 +184,7 @@ def simulate_batches(
         position_feedback: whether the controllers are told where the actuators stand, and predict from there; one for
             all or ``"lane"``.
         preview: as in `simulate`, for all lanes.
+        events: as in `simulate`, one list for all lanes or a list of them with one per lane.
         record: names of the fields of `Trajectory` to keep; the others are never stored.
         lanes_at_once: lanes of one piece; fewer where the lanes then divide evenly. Each size compiles once.
         devices: to spread the lanes over; all of this process if not given.
@@ -202,6 +207,7 @@ def simulate_batches(
         faults=faults,
         position_feedback=position_feedback,
         preview=preview,
+        events=events,
     )
     unknown = [field for field in record if field not in RECORDABLE]
     if unknown:
@@ -230,14 +236,25 @@ def _pieces(sweep: Sweep, record, lanes_at_once: int, devices, progress) -> Iter
         yield TrajectoryBatch(  # no name keeps it: it is gone when the caller lets go
             lanes=index[:real],
             setpoint=sweep.setpoints_of(index[:real]),
-            fields=simulate_compiled(
-                sweep.controllers_of(index),
-                sweep.plants.take(index),
-                sweep.inputs_of(index),
-                record,
-                real=real,
-                devices=devices,
-                progress=report,
-            ),
+            fields=_fields(sweep, index, real, record, devices, report),
             **_labels(sweep.structure, sweep.samples),
         )
+
+
+def _fields(sweep: Sweep, index: np.ndarray, real: int, record, devices, report) -> dict[str, np.ndarray]:
+    """Recorded fields of some lanes, of which the first `real` count."""
+    if not isinstance(sweep.plants, Lanes):
+        index = index[:real]
+        own, plants = sweep.controllers_of(index), [sweep.plants[k] for k in index]
+        fields, _ = simulate_host_lanes(own, plants, sweep.inputs_of(index), report, sweep.stages_of(index))
+        return {name: fields[name] for name in record}
+    return simulate_compiled(
+        sweep.controllers_of(index),
+        sweep.plants.take(index),
+        sweep.inputs_of(index),
+        record,
+        stages=sweep.stages_of(index),
+        real=real,
+        devices=devices,
+        progress=report,
+    )

@@ -17,7 +17,7 @@ from jaxmpc.check import as_floats
 from jaxmpc.errors import InputError, PlantError
 from jaxmpc.process.actuator import Actuator, Actuators
 from jaxmpc.process.integration import runge_kutta, settle, whole_steps
-from jaxmpc.process.plant import JaxPlant, Outputs, Parameter, checked_parameters
+from jaxmpc.process.plant import JaxPlant, Outputs, Parameter, Steady, checked_parameters
 
 STEADY = 1e-10  # scaled change per sample below which a state counts as steady
 SAMPLES = 360  # of one round of simulation on the way to a steady state
@@ -61,7 +61,7 @@ class FunctionPlant(JaxPlant):
     substep: float = eqx.field(static=True)
     disturbance_names: tuple[str, ...] = eqx.field(static=True)
     actuators: Actuators = eqx.field(static=True)
-    steady: bool = eqx.field(static=True)  # whether it starts in the steady state near `start`
+    settles: bool = eqx.field(static=True)  # whether it starts in the steady state near `start`
     table: tuple[Parameter, ...] = eqx.field(static=True)
     start: Float[np.ndarray, " state"]
     start_mv: Float[np.ndarray, " mv"]
@@ -85,8 +85,8 @@ class FunctionPlant(JaxPlant):
             raise InputError(
                 "plant.state", state, "where it starts, or a guess of the steady state; one of both"
             )
-        self.rates, self.outputs, self.steady = rates, outputs, state is None
-        self.start = _row("guess" if self.steady else "state", guess if self.steady else state)
+        self.rates, self.outputs, self.settles = rates, outputs, state is None
+        self.start = _row("guess" if self.settles else "state", guess if self.settles else state)
         self.start_mv = _row("mv", mv)
         self.dt, self.substep = dt, dt / 10 if substep is None else substep
         whole_steps(self.dt, self.substep)
@@ -120,9 +120,9 @@ class FunctionPlant(JaxPlant):
             PlantError: if no steady state is found. A lane of several plants starts where the search has led to, then.
         """
         position = jnp.asarray(self.start_mv, dtype=jnp.float64)
-        if not self.steady:
+        if not self.settles:
             return FunctionState(jnp.asarray(self.start, dtype=jnp.float64), position)
-        x, drift = _steady(self)
+        x, drift = _steady(self, position, self._disturbed(0.0))
         if not isinstance(drift, Tracer) and not bool(drift <= STEADY):
             raise PlantError(
                 f"No steady state was found from the guess {np.asarray(self.start).tolist()} with MVs at "
@@ -132,11 +132,18 @@ class FunctionPlant(JaxPlant):
             )
         return FunctionState(x, position)
 
+    def steady(self, mv: ArrayLike, disturbance: ArrayLike = 0.0) -> Steady:
+        """The steady state near `start` with held MVs [MV unit]; pure and never raising."""
+        position, d = jnp.asarray(mv, dtype=jnp.float64), self._disturbed(disturbance)
+        x, drift = _steady(self, position, d)
+        outputs = Outputs(self._of("outputs", x, position, d), position)
+        return Steady(FunctionState(x, position), outputs, drift <= STEADY)
+
     def step(
         self, state: FunctionState, mv: Float[Array, " mv"], disturbance: ArrayLike = 0.0
     ) -> tuple[FunctionState, Outputs]:
         """One sample, see `JaxPlant.step`."""
-        d = jnp.broadcast_to(jnp.asarray(disturbance, dtype=jnp.float64), (len(self.disturbance_names),))
+        d = self._disturbed(disturbance)
         position = self.actuators.move(state.position, jnp.asarray(mv, dtype=jnp.float64))
         steps = whole_steps(self.dt, self.substep)
         (x,) = runge_kutta(lambda x: (self._of("rates", x[0], position, d),), (state.x,), steps, self.substep)
@@ -145,6 +152,10 @@ class FunctionPlant(JaxPlant):
     def measure(self, state: FunctionState) -> Outputs:
         """What it measures in `state`, undisturbed."""
         return Outputs(self._of("outputs", state.x, state.position), state.position)
+
+    def _disturbed(self, disturbance: ArrayLike) -> Array:
+        """The disturbances, given as a vector or one number for all."""
+        return jnp.broadcast_to(jnp.asarray(disturbance, dtype=jnp.float64), (len(self.disturbance_names),))
 
     def _of(self, name: str, x, position, d=None):
         """What one of the functions returns, as an array."""
@@ -156,11 +167,11 @@ class FunctionPlant(JaxPlant):
 
 
 @eqx.filter_jit
-def _steady(plant: FunctionPlant) -> tuple[Array, Array]:
+def _steady(plant: FunctionPlant, position: Array, d: Array) -> tuple[Array, Array]:
     """The steady state, and what is left of its scaled drift [1/sample]."""
-    start, position = jnp.asarray(plant.start), jnp.asarray(plant.start_mv)
+    start = jnp.asarray(plant.start)
     scale = jnp.where(start == 0.0, 1.0, jnp.abs(start))
-    slope = lambda x: plant._of("rates", x, position)  # noqa: E731
+    slope = lambda x: plant._of("rates", x, position, d)  # noqa: E731
 
     def onward(s, wanted):
         steps = jnp.where(wanted, SAMPLES * whole_steps(plant.dt, plant.substep), 0)

@@ -146,24 +146,22 @@ class ModelPlant(JaxPlant):
         of_each = np.moveaxis(pairs, -3, 0)
         gain, scale = (of_all[k] * of_each[k] for k in (0, 2))
         dead = of_all[1] + of_each[1]
-        self._check_dead_times(dead / scale)
+        self._check_dead_times(dead, scale)
         coefficients = warped(self.nominal, gain, dead / self.dt, scale)
         where = lambda p: (p.common, p.pairs, p.coefficients)  # noqa: E731
         return eqx.tree_at(where, self, (common, pairs, coefficients))
 
-    def _check_dead_times(self, seconds: np.ndarray) -> None:
-        """Refuse to take away more than a response has, ``"... cv input"``, in time of the model."""
+    def _check_dead_times(self, added: np.ndarray, scale: np.ndarray) -> None:
+        """Refuse to take away more seconds ``"... cv input"`` than a stretched response has."""
         size = np.abs(self.nominal)
         silent = np.cumsum(size > NOTHING * size.max(axis=-1, keepdims=True), axis=-1) == 0
-        has = np.where(silent.all(axis=-1), np.inf, silent.sum(axis=-1) * self.dt)
-        wrong = np.argwhere(-seconds > has * (1 + 1e-9))
+        least = -np.where(silent.all(axis=-1), np.inf, silent.sum(axis=-1) * self.dt) * scale
+        wrong = np.argwhere(added < least - 1e-9 * self.dt)
         if len(wrong):
-            *lane, i, j = (int(k) for k in wrong[0])
-            name = f"dead_time.{self.cv_names[i]}.{(*self.mv_names, *self.dv_names)[j]}"
-            taken = float(seconds[(*lane, i, j)])
-            raise InputError(
-                f"plant.{name}", taken, f"{-has[i, j]:g} s or more, as its response has no more dead time"
-            )
+            *_, i, j = where = tuple(int(k) for k in wrong[0])
+            name = f"plant.dead_time.{self.cv_names[i]}.{(*self.mv_names, *self.dv_names)[j]}"
+            expected = f"{least[where] + 0.0:g} s or more, as the response has no more dead time"
+            raise InputError(name, float(added[where]), expected)
 
     def init(self) -> ModelState:
         """At rest where it starts."""

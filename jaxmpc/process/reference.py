@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -87,6 +89,44 @@ class Reference:
             raise InputError("duration", duration, expected)
         kept = self.times < duration
         return Reference(self.times[kept], self.setpoints[kept], float(duration))
+
+    def filtered(self, time_constant, dt: float) -> Reference:
+        """These setpoints behind a first-order lag, which starts at the first of them.
+
+        Args:
+            time_constant: one for all CVs or ``"cv"`` [s]; 0 leaves the setpoints of a CV as they are.
+            dt: sampling interval, at which the new setpoints change [s].
+        """
+        constants = self._of_cvs("time_constant", time_constant, "s")
+        stays = np.exp(-dt / np.where(constants > 0.0, constants, 1.0)) * (constants > 0.0)
+        return self._followed(dt, lambda wanted, now: wanted + stays * (now - wanted))
+
+    def ramped(self, rate, dt: float) -> Reference:
+        """These setpoints at a limited rate of change, from the first of them on.
+
+        Args:
+            rate: largest one, one for all CVs or ``"cv"`` [CV unit/s]; infinite leaves the setpoints of a CV as they are.
+            dt: sampling interval, at which the new setpoints change [s].
+        """
+        most = self._of_cvs("rate", rate, "CV unit/s", infinite=True) * dt
+        return self._followed(dt, lambda wanted, now: now + np.clip(wanted - now, -most, most))
+
+    def _followed(self, dt: float, step: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Reference:
+        """Setpoints that follow these at every sample by a step from the wanted and the present ones."""
+        wanted = self.sample(dt)
+        rows = list(itertools.accumulate(wanted[1:], lambda now, new: step(new, now), initial=wanted[0]))
+        return Reference.from_samples(rows, dt)
+
+    def _of_cvs(self, field: str, given: Any, unit: str, *, infinite: bool = False) -> np.ndarray:
+        """One value per CV, or an InputError."""
+        values = as_floats(field, given, f"numbers [{unit}]")
+        positive = (values >= 0.0) & (np.isfinite(values) | infinite)
+        if values.shape not in ((), (self.cv_count,)) or not positive.all():
+            least = "0 or more" if infinite else "0 or more and finite"
+            raise InputError(
+                field, given, f"a number {least}, or one for each of {self.cv_count} CVs [{unit}]"
+            )
+        return np.broadcast_to(values, self.cv_count)
 
     @property
     def cv_count(self) -> int:

@@ -64,10 +64,14 @@ def for_all(value: T) -> Lanes[T]:
     return Lanes(*eqx.partition(value, lambda _: False))
 
 
-def lanes_of(trees: Sequence[T]) -> Lanes[T]:
-    """Lanes of separate trees of one form; a single one is shared by all lanes, however many there are."""
+def lanes_of(trees: Sequence[T], *, shared: bool | None = None) -> Lanes[T]:
+    """Lanes of separate trees of one form.
+
+    Args:
+        shared: whether the first is shared by all lanes, however many there are; if not given, where it is the only one.
+    """
     nothing = jax.tree.map(lambda _: None, trees[0])
-    if len(trees) == 1:
+    if len(trees) == 1 if shared is None else shared:
         return Lanes(nothing, trees[0])
     return Lanes(jax.tree.map(lambda *leaves: np.stack(leaves), *trees), nothing)
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 # The table: measured on 2 CPU cores with chunks of 64 scenarios and the thesis tuning. Smaller chunks are slower per
-# scenario, and tunings that move the choke readily take several times as long.
+# scenario, and tunings that move stepped MVs readily take several times as long.
 SAMPLES_PER_SECOND = {"continuous": 4000.0, "mixed-integer": 800.0}  # samples of one scenario
 MODEL_SECONDS = 1.0  # identification of one model
 

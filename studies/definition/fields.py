@@ -132,11 +132,13 @@ class Field:
 
 
 def as_text(value: Any) -> str:
-    """A flag, text or list of lengths or values as it stands in a coordinate and in a CSV file."""
+    """A number, flag, text or list of lengths or values as it stands in a coordinate and in a CSV file."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
         return value
+    if isinstance(value, (int, float)):
+        return f"{value:.10g}"
     return (
         "; ".join(map(as_text, value))
         if isinstance(value[0], (list, tuple))
@@ -196,9 +198,10 @@ def _controller_fields(process: Process) -> list[Field]:
         shaping("mean_move_window"),
         shaping("mean_move_mode"),
     ]
-    for mv in process.mvs:
+    dwells = (process.stepped and defaults.get("dwell")) or (1,) * len(process.mvs)
+    for mv, dwell in zip(process.mvs, dwells, strict=True):
         values = dict(kind="values", unit=mv.unit, low=-math.inf, high=math.inf, default=None)
-        for field in (shaping("integer_values", **values), shaping("dwell", default=1)):
+        for field in (shaping("integer_values", **values), shaping("dwell", default=dwell)):
             label = structure[field.key].meaning.format(f"the {mv.label}")
             out.append(dataclasses.replace(field, key=f"{field.key}.{mv.name}", label=label))
     return out
@@ -222,9 +225,9 @@ def _tuning_fields(process: Process) -> list[Field]:
 
 
 def _model_fields(process: Process) -> list[Field]:
-    """The working point of the step test; nothing to choose where the model is a file."""
+    """The working point of the step test; nothing to choose where there is none."""
     out = []
-    for mv in process.mvs if not process.model.file else ():
+    for mv in process.mvs if not process.model.given else ():
         step = abs(process.model.steps[mv.name])  # the step test goes that far, and stays within the range
         label, at = f"{mv.label} of the model's working point", process.model.working_point[mv.name]
         out.append(Field(f"model.{mv.name}", label, mv.unit, default=at, low=mv.low, high=mv.high - step))
@@ -244,6 +247,18 @@ def _run_fields(process: Process) -> list[Field]:
         Field(f"noise.{cv.name}", f"noise of the {cv.label}", cv.unit, default=0.0, low=0)
         for cv in process.cvs
     ]
+    out += [
+        Field(
+            f"setpoint_rate.{cv.name}",
+            f"largest rate of change of the setpoint of the {cv.label}",
+            f"{cv.unit}/s",
+            default=math.inf,
+            low=0,
+            infinite=True,
+            shape=True,
+        )
+        for cv in process.cvs
+    ]
     units = {disturbance.unit for disturbance in process.disturbances}
     out += [
         Field("seed", "seed of the noise", "1", "whole", 0, low=0, high=2**32 - 1),
@@ -251,6 +266,8 @@ def _run_fields(process: Process) -> list[Field]:
         Field("sensor_fault.duration", "duration of the sensor fault", "s", low=0),
         Field("sensor_fault.size", "size of the spike", "CV unit"),
         Field("position_feedback", "predictions from the positions of the actuators", "", "flag", False),
+        Field("preview", "future setpoints and measured disturbances are told", "", "flag", False),
+        Field("setpoint_filter", "time constant of the setpoint filter", "s", default=0.0, low=0, shape=True),
     ]
     if process.disturbances:
         unit = units.pop() if len(units) == 1 else "unit of the disturbance"
@@ -275,5 +292,6 @@ def find(fields: Mapping[str, Field], path: str, key: Any, *given: Any) -> Field
         # a last name that exists elsewhere, such as deadzone.NAME without tuning
         alike = [known for known in fields if known.endswith("." + str(key).rpartition(".")[2])][:3]
         hint = near(key, fields) or (f"Did you mean {' or '.join(alike)}?" if alike else "")
-        raise InputError(path, (*given, key)[0], "a key of docs/studies.md", hint)
+        expected = "a key that jaxmpc process keys PROCESS lists for the process of the study"
+        raise InputError(path, (*given, key)[0], expected, hint)
     return fields[key]

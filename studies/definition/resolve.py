@@ -37,7 +37,8 @@ class Variant:
     kind: str  # continuous or mixed-integer
     actuator: str  # whether MVs move as their actuators do (step) or take every value (continuous)
     structure: Structure  # of the controller
-    reference: Reference  # setpoints, cut to the length of the run
+    reference: Reference  # setpoints, cut to the length of the run, filtered and ramped
+    windows: Reference  # the same before that
     samples: int  # length of the run [samples]
 
 
@@ -63,6 +64,7 @@ class Inputs:
     fault_kinds: tuple[tuple[str, str], ...]  # CV and kind of every sensor fault
     faults: np.ndarray  # "scenario fault 3", time [s], duration [s] and size [CV unit] of the sensor faults
     told: np.ndarray  # "scenario", whether the controller is told where the actuators stand
+    preview: np.ndarray  # "scenario", whether it is told future setpoints and measured disturbances
 
 
 def row(array: np.ndarray, k: int) -> np.ndarray:
@@ -139,7 +141,7 @@ def resolve(definition: StudyDefinition, table: AxisTable) -> Inputs:
         variant=variant,
         tuning=_tuning(settings, kinds[variant] if len(set(kinds)) > 1 else kinds[:1]),
         plant=_plant(settings),
-        point=settings.columns([f"model.{name}" for name in process.mv_names if not process.model.file]),
+        point=settings.columns([f"model.{name}" for name in process.mv_names if not process.model.given]),
         noise=settings.columns([f"noise.{name}" for name in process.cv_names]),
         seed=settings.numbers("seed").astype(np.int64),
         step_names=tuple(
@@ -150,6 +152,7 @@ def resolve(definition: StudyDefinition, table: AxisTable) -> Inputs:
         fault_kinds=tuple((fault.cv, fault.kind) for fault in settings.base.get("sensor_fault", ())),
         faults=_events(settings, "sensor_fault", ("time", "duration", "size"), *runs),
         told=settings.numbers("position_feedback").astype(bool),
+        preview=settings.numbers("preview").astype(bool),
     )
     check_deviation(inputs.noise, len(process.cvs))
     check_seed(inputs.seed)
@@ -161,20 +164,23 @@ def resolve(definition: StudyDefinition, table: AxisTable) -> Inputs:
 
 def _variants(settings: Settings) -> tuple[tuple[Variant, ...], np.ndarray]:
     firsts, index = settings.combinations([key for key, field in settings.fields.items() if field.shape])
-    cut: dict[tuple[Any, Any], Reference] = {}
+    cut: dict[Any, tuple[Reference, Reference]] = {}
     variants = []
     for k in firsts.tolist():
         value = lambda key, k=k: settings.value(key, k)  # noqa: E731
         structure = _structure(settings, k)
-        wanted = value("reference"), value("duration")
+        own = tuple(value(f"setpoint_rate.{name}") for name in settings.definition.process.cv_names)
+        wanted = value("reference"), value("duration"), value("setpoint_filter"), own
         if wanted not in cut:
             cut[wanted] = _reference(settings, k, *wanted)
-        reference = cut[wanted]
+        reference, windows = cut[wanted]
         samples = reference.samples(structure.dt)
         path = settings.table.blame(["reference" if wanted[1] is None else "duration"], k)
         require(samples >= 1, path, wanted[1], f"one sample of {structure.dt:g} s or more")
         require(samples <= LONGEST_RUN, path, f"{samples} samples", f"a run of at most {LONGEST_RUN} samples")
-        variants.append(Variant(value("controller"), value("actuator"), structure, reference, samples))
+        variants.append(
+            Variant(value("controller"), value("actuator"), structure, reference, windows, samples)
+        )
     return tuple(variants), index
 
 
@@ -182,9 +188,10 @@ def _structure(settings: Settings, k: int) -> Structure:
     """The structure of one scenario; without a control horizon the blocks decide it."""
     value = lambda key: settings.value(key, k)  # noqa: E731
     blocks, blocking = value("blocks"), value("blocking")
-    horizon = value("control_horizon") or sum(blocks[0] if isinstance(blocks[0], tuple) else blocks)
     process = settings.definition.process
     base = process.structure("moves", integer=value("controller") == "mixed-integer")
+    of_one = blocks[0] if blocks and isinstance(blocks[0], tuple) else blocks
+    horizon = value("control_horizon") or sum(of_one) or base.control_horizon
     own: dict[str, Any] = {}
     if base.integer_mvs:
         given = [value(f"integer_values.{name}") for name in process.mv_names]
@@ -214,14 +221,17 @@ def _structure(settings: Settings, k: int) -> Structure:
         )
 
 
-def _reference(settings: Settings, k: int, name: Any, duration: float | None) -> Reference:
-    """A named or own reference, cut to a duration [s]; changes that the run would not reach are left out."""
+def _reference(
+    settings: Settings, k: int, name: Any, duration: float | None, lag: float, rates: tuple[float, ...]
+) -> tuple[Reference, Reference]:
+    """A named or own reference, cut to a duration [s]: filtered and ramped, and before that."""
     process = settings.definition.process
     whole = name.build(process, "base.") if isinstance(name, ReferenceDefinition) else process.reference(name)
-    if duration is None or duration == whole.duration:
-        return whole
-    with located(lambda _: settings.table.blame(["duration"], k)):
-        return whole.cut(duration)
+    if duration is not None and duration != whole.duration:
+        with located(lambda _: settings.table.blame(["duration"], k)):
+            whole = whole.cut(duration)
+    moved = whole.filtered(lag, process.dt) if lag else whole
+    return (moved.ramped(rates, process.dt) if np.isfinite(rates).any() else moved), whole
 
 
 # --------------------------------------------------------------------------------------------------------- tuning

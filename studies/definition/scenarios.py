@@ -17,6 +17,7 @@ from msgspec import UnsetType
 from identify.plants import model_samples
 from jaxmpc import html
 from jaxmpc.controller.measurement import SensorFault, fault_errors
+from jaxmpc.loop.events import Event, stages_of
 from jaxmpc.loop.trajectory import AXES
 from jaxmpc.problem.layout import Size
 from jaxmpc.problem.structure import Structure
@@ -51,11 +52,14 @@ class Scenario:
         model_point: working point of the model, ``"mv"`` [MV unit], identified on the plant with its own parameters.
         plant: parameters of the plant that is controlled, where they are not its own, in the units of their keys.
         reference: setpoints; the same object for scenarios with the same ones.
+        windows: the same before they are filtered or ramped, for the windows of key figures.
         noise: standard deviation ``"cv"`` [CV unit]; None without noise.
         seed: of the noise.
         disturbance: ``"sample disturbance"``, in the order of the process; None without any.
         faults: errors of failing sensors ``"sample cv"`` (`jaxmpc.controller.measurement.fault_errors`); None without any.
         position_feedback: whether the controller is told where the actuators stand.
+        preview: whether it is told future setpoints and measured disturbances.
+        events: what changes in it during the run.
     """
 
     number: int
@@ -66,12 +70,15 @@ class Scenario:
     model_point: models.Point
     plant: dict[str, float]
     reference: Reference
+    windows: Reference
     samples: int
     noise: np.ndarray | None
     seed: int
     disturbance: np.ndarray | None
     faults: np.ndarray | None
     position_feedback: bool
+    preview: bool
+    events: tuple[Event, ...]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -84,6 +91,7 @@ class Group:
         kind, actuator, structure, samples: what all of them have.
         has_limits: whether they have a finite CV limit.
         switching: whether bad measurements may switch a CV off.
+        preview: whether the controllers are told future setpoints and measured disturbances.
         points: distinct working points of their models.
         scenarios: their numbers, increasing.
     """
@@ -94,6 +102,7 @@ class Group:
     samples: int
     has_limits: bool
     switching: bool
+    preview: bool
     points: tuple[models.Point, ...]
     scenarios: np.ndarray
     model_samples: int  # coefficients of the models
@@ -150,6 +159,11 @@ class Study:
         """That is controlled."""
         return self.definition.process
 
+    @functools.cached_property
+    def events(self) -> tuple[Event, ...]:
+        """What changes in every controller during its run."""
+        return tuple(section.event() for section in self.definition.base.get("event", ()))
+
     @property
     def model_points(self) -> tuple[models.Point, ...]:
         """Distinct working points of all models, for `models.identify_models`."""
@@ -169,12 +183,15 @@ class Study:
             model_point=tuple(row(inputs.point, k).tolist()),
             plant={name: float(row(values, k)) for name, values in inputs.plant.items()},
             reference=variant.reference,
+            windows=variant.windows,
             samples=variant.samples,
             noise=noise.copy() if noise.any() else None,
             seed=int(row(inputs.seed, k)),
             disturbance=self._disturbance(k),
             faults=self._faults(k),
             position_feedback=bool(row(inputs.told, k)),
+            preview=bool(row(inputs.preview, k)),
+            events=self.events,
         )
 
     def scenario_hash(self, k: int) -> str:
@@ -192,6 +209,8 @@ class Study:
             self._disturbance(k),
             self._faults(k),
             bool(row(inputs.told, k)),
+            bool(row(inputs.preview, k)),
+            [dataclasses.asdict(event) for event in self.events],
         )
 
     @functools.cached_property
@@ -328,7 +347,8 @@ def expand_sweep(definition: StudyDefinition, *, confirmed: bool = False) -> Stu
             chunks.append(Chunk(len(chunks), g, group.scenarios[begin : begin + size]))
     study = Study(definition, len(table), _columns(table), groups, tuple(chunks), size, inputs)
     for group in groups:  # the typed objects agree with the checks of whole columns
-        study.scenario(int(group.scenarios[0]))
+        first = study.scenario(int(group.scenarios[0]))
+        stages_of(first.structure, first.tuning, study.events, first.samples, "base.event")
     return study
 
 
@@ -354,11 +374,12 @@ def _groups(inputs: Inputs, count: int, samples: int) -> tuple[Group, ...]:
     tuning = inputs.tuning
     limited = np.any(np.isfinite(tuning["cv_low"]) | np.isfinite(tuning["cv_high"]), axis=1)
     switching = np.any(np.isfinite(tuning["bad_limit"]), axis=1)
-    members: dict[tuple[Any, Any, Any, int, bool, bool], list[int]] = {}
+    members: dict[tuple[Any, Any, Any, int, bool, bool, bool], list[int]] = {}
     for k in range(count):
         variant = inputs.variants[inputs.variant[k]]
         same = variant.kind, variant.actuator, variant.structure, variant.samples
-        members.setdefault((*same, bool(row(limited, k)), bool(row(switching, k))), []).append(k)
+        facts: Any = tuple(bool(row(values, k)) for values in (limited, switching, inputs.preview))
+        members.setdefault((*same, *facts), []).append(k)
     groups = []
     for key, scenarios in members.items():
         points = dict.fromkeys(tuple(row(inputs.point, k).tolist()) for k in scenarios)

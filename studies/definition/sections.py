@@ -8,12 +8,13 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from jaxmpc.controller.measurement import FAULTS
+from jaxmpc.loop.events import Event
 from jaxmpc.loop.trajectory import AXES
+from jaxmpc.process.file import DEFAULT_PROCESS
 from jaxmpc.process.process import Process
 from jaxmpc.process.reference import Reference
 from studies.definition.refusing import located, require
 
-DEFAULT_PROCESS = "gas-lifted-well"
 Count = Annotated[int, msgspec.Meta(ge=1)]
 STORABLE = tuple(name for names in AXES.values() for name in names if name != "time")
 
@@ -141,6 +142,21 @@ class DisturbanceStep(Section, frozen=True):
     time: float
     offset: float
     name: str = ""  # of the disturbance; not needed where there is one
+
+
+class EventSection(Section, frozen=True):
+    """``[[base.event]]``: what changes in the controller from `time` [s] on, as in `jaxmpc.loop.events.Event`."""
+
+    time: float
+    tuning: dict[str, Any] = {}
+    cv_off: tuple[str, ...] = ()
+    cv_on: tuple[str, ...] = ()
+    mv_off: tuple[str, ...] = ()
+    mv_on: tuple[str, ...] = ()
+
+    def event(self) -> Event:
+        """As loops take it."""
+        return Event(**msgspec.structs.asdict(self))
 
 
 class FaultSection(Section, frozen=True):

@@ -31,6 +31,7 @@ from studies.definition.sections import (
     Axis,
     Cut,
     DisturbanceStep,
+    EventSection,
     FaultSection,
     Quick,
     Range,
@@ -53,7 +54,8 @@ class StudyDefinition:
     process: Process
     fields: Mapping[str, Field]  # the keys that base and axes may have
     # settings by key (`fields`), only those that are given; besides, reference may be an
-    # `ReferenceDefinition`, disturbance is a tuple of `DisturbanceStep` and sensor_fault one of `FaultSection`
+    # `ReferenceDefinition`, disturbance is a tuple of `DisturbanceStep`, event one of `EventSection` and sensor_fault one of
+    # `FaultSection`
     base: dict[str, Any]
     axes: tuple[Axis, ...]
     sampling: Sampling
@@ -185,9 +187,9 @@ def load_definition(name_or_path: str | Path, process: str | Path | None = None)
 
 
 def shipped_studies() -> dict[str, Path]:
-    """Definitions that come with the package, by name."""
-    folder = Path(str(resources.files("studies")))
-    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+    """Definitions that come with the package, by name: of the well, then one for each other process of the library."""
+    root = Path(str(resources.files("studies")))
+    return {path.stem: path for folder in (root, root / "library") for path in sorted(folder.glob("*.toml"))}
 
 
 # ------------------------------------------------------------------------------------------------------- decoding
@@ -281,7 +283,10 @@ def _events(
     for i, event in enumerate(events):
         for name in ("time", "offset", "duration", "size"):
             if (given := getattr(event, name, UNSET)) is not UNSET:
-                fields[f"{table}.{name}"].check(f"{where}[{i}].{name}", given)
+                key = "sensor_fault.time" if table == "event" else f"{table}.{name}"
+                fields[key].check(f"{where}[{i}].{name}", given)
+        if table == "event":
+            continue
         if table == "sensor_fault":
             require(
                 event.cv in process.cv_names,
@@ -303,6 +308,7 @@ def _events(
 
 _EVENTS: dict[str, tuple[Any, str]] = {
     "disturbance": (DisturbanceStep, "steps of disturbances"),
+    "event": (EventSection, "changes of the controller"),
     "sensor_fault": (FaultSection, "faults of sensors"),
 }
 _EXPECTED = {

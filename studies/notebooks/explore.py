@@ -138,7 +138,7 @@ def _(SLIDER, controls, explore, explored, mo):
         }
     )
     _of = lambda *heads: [e for key, e in scenario.elements.items() if key.startswith(heads)]  # noqa: E731
-    _from = f"<b>Setpoints</b> from {explore.STEP * explored.process.dt:g} s"
+    _from = f"<span><b>Setpoints</b> from {explore.STEP * explored.process.dt:g} s</span>"
     setpoint_panel = mo.vstack([mo.Html(_from), *_of("setpoint.")], gap=0.4)
     _more = _of("disturbance.", "model.")
     model_panel = mo.accordion({"Disturbances and model": mo.vstack(_more, gap=0.4)}) if _more else mo.md("")
@@ -294,7 +294,10 @@ def _(chart, draw, export, controls, get_pins, mo, page, pin, pin_name, refused,
                 '<div id="key-figures" style="font-size:12px;line-height:1.3;white-space:nowrap">'
                 f"{export.figures_table(runs, colours)}</div>"
             ),
-            mo.hstack([pin, pin_name], justify="start", widths=[1, 1], align="center"),
+            mo.Html(
+                '<div style="display:flex;gap:0.5rem;align-items:center;white-space:nowrap">'
+                f'{pin}<span style="width:7rem">{pin_name}</span></div>'
+            ),
             mo.hstack(list(unpin.elements), justify="start", wrap=True),
             mo.md(f"<small>run and key figures: {run.seconds:.2f} s</small>"),
         ]

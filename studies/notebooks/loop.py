@@ -239,7 +239,7 @@ def shown_figures(process: Process) -> list[tuple[str, str, str]]:
 
 def written(value: float, unit: str) -> tuple[str, str]:
     """A key figure and its unit as they are printed: times below a second in ms, others as they are."""
-    if unit == "s" and abs(value) < 1:
+    if unit == "s" and 0 < abs(value) < 1:
         value, unit = 1e3 * value, "ms"
     number = f"{value:,.4g}" if not abs(value) >= 1e4 else f"{value:,.0f}"
     return number, "" if unit == "1" else unit.replace("m3", "m³")

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from identify.plants import disturbance_of, open_plant
+from identify.plants import closing, disturbance_of, open_plant
 from jaxmpc.controller.controller import Controllers
 from jaxmpc.files import strict_json
 from jaxmpc.loop.simulate import simulate_batches
@@ -117,7 +117,7 @@ def run_scenarios(
         return None if none else np.stack([np.zeros(shape) if value is None else value for value in given])
 
     plants = _plants(process, plant, filled, varying)
-    shared = plants.shared if isinstance(plants, Lanes) else plants
+    shared = plants.shared if isinstance(plants, Lanes) else plants[0] if isinstance(plants, list) else plants
     offsets = stacked("disturbance", first.samples, len(process.disturbances))
     batches = simulate_batches(
         controllers,
@@ -129,12 +129,14 @@ def run_scenarios(
         seed=seeds,
         faults=stacked("faults", first.samples, cvs),
         position_feedback=np.array([s.position_feedback for s in filled]),
+        preview=first.preview,
+        events=first.events,
         record=tuple(dict.fromkeys((*RECORD, *(f for f in trajectories if f != "setpoint")))),
         lanes_at_once=lanes,
     )
     (batch,) = batches
     simulated = clock.seconds
-    windows = np.stack([s.reference.window(s.structure.dt, s.samples) for s in filled])
+    windows = np.stack([s.windows.window(s.structure.dt, s.samples) for s in filled])
     figures = batch_kpis(
         batch, stack_tunings(tunings), windows, measures_of(process), tolerance=process.settled
     )
@@ -156,11 +158,16 @@ def run_scenarios(
 
 def _plants(
     process: Process, name: str, scenarios: Sequence[Scenario], varying: Sequence[str]
-) -> Lanes[JaxPlant] | JaxPlant:
-    """One plant per lane, parameters that do not vary within the group kept once; or one for all."""
+) -> Lanes[JaxPlant] | JaxPlant | list[Any]:
+    """One plant per lane, parameters that do not vary within the group kept once; or one for all. A list on the host."""
     first = scenarios[0]
     shared = {key: value for key, value in first.plant.items() if key not in varying}
     plant = open_plant(process, name, actual=first.actuator == "step", parameters=shared)
+    if not isinstance(plant, JaxPlant):
+        with closing(plant):
+            if hasattr(plant, "replaced"):  # an FMU is looked into once
+                return [plant.replaced({key: s.plant[key] for key in varying}) for s in scenarios]
+        return [open_plant(process, name, actual=first.actuator == "step") for _ in scenarios]
     if not varying:
         return plant
     return lanes_of_plants(plant, {key: np.array([s.plant[key] for s in scenarios]) for key in varying})

@@ -18,17 +18,17 @@ import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
-from identify.plants import disturbance_of
+from identify.plants import closing, disturbance_of
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.schedule import ModelSchedule, ScheduledController
 from jaxmpc.errors import InputError
 from jaxmpc.files import strict_json
+from jaxmpc.loop.events import Event
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS as TUNING
-from jaxmpc.problem.tuning import Tuning
 from jaxmpc.process.file import process_digest
 from jaxmpc.process.process import Process
 from jaxmpc.programs.clock import Clock
@@ -156,24 +156,22 @@ def run_controller(
     schedule: ModelSchedule | None = None,
 ) -> Trajectory:
     """One closed loop of a comparison."""
-    structure = definition.structure(process)
-
-    def controller(tuning: Tuning) -> Controller:
-        if definition.schedule:
-            if schedule is None:
-                raise InputError("schedule", None, f"a gain schedule for {definition.name}")
-            return ScheduledController(structure, tuning, schedule, time_limit=definition.time_limit)
-        return Controller(structure, tuning, model, time_limit=definition.time_limit)
-
+    made = definition.structure(process), definition.build_tuning(process)
+    if not definition.schedule:
+        controller = Controller(*made, model, time_limit=definition.time_limit)
+    elif schedule is None:
+        raise InputError("schedule", None, f"a gain schedule for {definition.name}")
+    else:
+        controller = ScheduledController(*made, schedule, time_limit=definition.time_limit)
     plant = make_plant(definition.actuator == "step")
     with progress_bar(definition.label, progress) as report, closing(plant):
         return simulate(
-            controller(definition.build_tuning(process)),
+            controller,
             plant,
             comparison.reference.build(process),
             disturbance=disturbance_of(process, plant, comparison.offsets(process)),
             position_feedback=definition.position_feedback,
-            changes=[(at, controller(tuning)) for at, tuning in definition.later_tunings(process)],
+            events=[Event(change.at, change.changes) for change in definition.then],
             open_loop_from=definition.open_loop_from,
             keep_plans=True,
             progress=report,
@@ -194,17 +192,6 @@ def progress_bar(label: str, show: bool) -> Iterator[Callable[[int, int], None]]
             bar.update(done - bar.n)
 
         yield report
-
-
-@contextlib.contextmanager
-def closing(plant: Any) -> Iterator[Any]:
-    """A plant, freed at the end if it holds anything outside Python."""
-    try:
-        yield plant
-    finally:
-        close = getattr(plant, "close", None)
-        if close is not None:
-            close()
 
 
 def results_layout(

@@ -26,7 +26,7 @@ FLAG = "complete"  # the one variable that the store also knows
 class Column:
     """One scenario coordinate: what differs between the scenarios."""
 
-    key: str  # full key of the definition, for example ``tuning.deadzone.gas_rate``
+    key: str  # full key of the definition, for example ``tuning.deadzone.NAME``
     label: str  # in words, for tables and axes
     unit: str  # ``"1"`` for a number without unit, ``""`` for text
     values: np.ndarray  # one per scenario, numbers or text

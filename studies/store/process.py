@@ -7,9 +7,8 @@ from typing import Any
 import xarray as xr
 
 from jaxmpc.files import from_strict_json
-from jaxmpc.process.file import load_process, process_of
+from jaxmpc.process.file import DEFAULT_PROCESS, load_process, process_of
 from jaxmpc.process.process import Process
-from studies.definition.sections import DEFAULT_PROCESS
 from studies.store.reading import provenance
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from identify.plants import model_of, open_plant, plant_facts
+from identify.plants import closing, model_of, open_plant, plant_facts
 from identify.steady_map import steady_map
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.targets import TargetController
@@ -29,7 +29,7 @@ from jaxmpc.process.reference import Reference
 from jaxmpc.process.well.grids import LIFT_RANGES, STEADY_MAP
 from jaxmpc.steady.map import SteadyMap
 from jaxmpc.steady.optimise import Targets, optimise
-from studies.run.comparison import closing, labelled, progress_bar, results_layout, run_missing
+from studies.run.comparison import labelled, progress_bar, results_layout, run_missing
 from studies.store.files import RESULTS
 from studies.store.fingerprint import content_hash, module_hash, source_hash
 from studies.store.layout import StoreLayout

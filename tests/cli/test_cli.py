@@ -1,5 +1,6 @@
 """The command line: exit status, what is printed and written, and that bad input leaves no trace."""
 
+import contextlib
 import json
 import subprocess
 import sys
@@ -212,7 +213,6 @@ def test_an_output_that_cannot_be_written_is_refused_before_the_solve(write, tmp
         ["fmu", "build", "--fmi", "1"],
         ["identify", "--samples", "many"],
         ["study", "run"],
-        ["study", "run", "thesis", "--plant", "septic"],
         ["bench", "relaxed"],
     ],
 )
@@ -231,8 +231,8 @@ def test_unknown_commands_and_options_are_bad_input(arguments, unsolved, capsys)
         ([], ["plan", "fmu", "identify", "study", "bench"]),
         (["plan"], ["--out", "standard output", "--finish", "default: auto", "3 infeasible"]),
         (["fmu", "build"], ["--fmi", "default: 2"]),
-        (["identify"], ["[%]", "[m3/h]", "default: 7500.0", "default: 250", "10 s"]),
-        (["study", "run", "thesis"], ["default: results", "--quick", "default: fmu"]),
+        (["identify"], ["MV=VALUE", "default: the first", "[samples]", "default: model.json"]),
+        (["study", "run", "thesis"], ["default: results", "--quick", "default: that of the study"]),
         (["bench"], ["--quick", "default: all", "default: nowhere", "[ms]", "jaxmpc[bench]", "Ctrl-C"]),
     ],
 )
@@ -277,7 +277,9 @@ def test_a_plant_that_fails_ends_with_one_line_and_status_one(stub, tmp_path, ca
     def crash(*_):
         raise PlantError("well.fmu: the FMU ended its process with signal SIGABRT during doStep at t = 10 s")
 
-    stub("identify.step_test", identify_step_response=crash, settling_notes=list)
+    stub(
+        "identify.plants", closing=contextlib.nullcontext, identified=crash, open_plant=lambda *_, **__: None
+    )
     assert main(["identify", "--plant", "jax", "--out", str(tmp_path / "model.json")]) == 1
     assert capsys.readouterr().err == (
         "jaxmpc: well.fmu: the FMU ended its process with signal SIGABRT during doStep at t = 10 s\n"
@@ -295,7 +297,7 @@ def test_fmu_build_prints_where_the_fmu_is(stub, tmp_path, capsys):
 
 def test_identify_writes_a_model_that_says_where_it_comes_from(tmp_path, capsys):
     out = tmp_path / "model.json"
-    options = ["--plant", "jax", "--choke", "40", "--lift", "7000", "--steps", "2", "50", "--samples", "20"]
+    options = ["--at", "choke=40", "--at", "gas_lift=7000", "--step", "gas_lift=50", "--samples", "20"]
     assert main(["identify", *options, "--out", str(out)]) == 0
     model = json.loads(out.read_text())
     assert (model["working_point"]["choke"], model["working_point"]["gas_lift"]) == (40.0, 7000.0)
@@ -306,7 +308,7 @@ def test_identify_writes_a_model_that_says_where_it_comes_from(tmp_path, capsys)
 
 def test_identify_refuses_a_working_point_outside_the_well(tmp_path, capsys):
     out = tmp_path / "model.json"
-    assert main(["identify", "--plant", "jax", "--choke", "101", "--out", str(out)]) == 2
+    assert main(["identify", "--plant", "jax", "--at", "choke=101", "--out", str(out)]) == 2
     assert "choke" in capsys.readouterr().err
     assert not out.exists()
 
@@ -315,10 +317,11 @@ def test_the_thesis_study_gets_its_options_and_bad_ones_are_reported(stub, tmp_p
     given = []
     stub(
         "studies.thesis.catalogue",
-        run_named=lambda *options: given.append(options) or tmp_path / "r" / "thesis",
+        STUDIES=("thesis",),
+        run_thesis=lambda *options: given.append(options) or tmp_path / "r" / "thesis",
     )
     stub("figures.registry", draw_study=lambda *options: given.append(options))
-    stub("studies.thesis.report", write_summary=lambda *options: given.append(options))
+    stub("studies.thesis.report", write_thesis_summary=lambda *options: given.append(options))
     assert main(["study", "run", "thesis", "--out", str(tmp_path / "r"), "--quick", "--plant", "jax"]) == 0
     assert given == [("thesis", tmp_path / "r", True, "jax"), *2 * [(tmp_path / "r" / "thesis", "thesis")]]
     assert str(tmp_path / "r" / "thesis" / "summary.md") in capsys.readouterr().out
@@ -326,17 +329,24 @@ def test_the_thesis_study_gets_its_options_and_bad_ones_are_reported(stub, tmp_p
     def refuse(*_):
         raise InputError("reference.duration", 10, "at least 20 s")
 
-    stub("studies.thesis.catalogue", run_named=refuse)
+    stub("studies.thesis.catalogue", STUDIES=("thesis",), run_thesis=refuse)
     assert main(["study", "run", "thesis", "--out", str(tmp_path / "r")]) == 2
     assert "reference.duration" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_every_study_of_the_catalogue_can_be_named_on_the_command_line():
-    from jaxmpc.cli.study import COMPARISONS
+def test_a_plant_that_a_comparison_does_not_have_is_bad_input(tmp_path, capsys):
+    assert main(["study", "run", "thesis", "--plant", "septic", "--out", str(tmp_path / "r")]) == 2
+    assert "one of fmu, jax" in capsys.readouterr().err
+    assert not (tmp_path / "r").exists()
+
+
+def test_every_comparison_can_be_named_on_the_command_line():
+    from studies.definition.catalogue import is_comparison
     from studies.thesis.catalogue import STUDIES
 
-    assert set(STUDIES) <= set(COMPARISONS)
+    assert all(map(is_comparison, (*STUDIES, "comparison")))
+    assert not is_comparison("deadzone")
 
 
 def test_figures_are_listed_without_an_id_and_produced_with_one(stub, tmp_path, capsys):

@@ -52,6 +52,20 @@ def test_disturbances_are_changes_from_what_their_variables_start_with(path):
         assert plant.step([1.0], 0.0).cv == 2004.5
 
 
+def test_signals_have_the_names_of_the_process_whatever_the_fmu_calls_them(path):
+    variables = {"valve": "u", "load": "bias", "total": "sum"}
+    given = dict(dt=10.0, variables=variables, working_point={"valve": 2.0})
+    with FmuPlant(path, {"valve": (0.0, 10.0)}, ["total"], ["load"], **given) as plant:
+        assert (plant.mv_names, plant.cv_names, plant.disturbance_names) == (
+            ("valve",),
+            ("total",),
+            ("load",),
+        )
+        undisturbed = plant.init().cv
+        assert plant.step([12.0], [0.25]).cv - undisturbed == 10.0 - 2.0 + 0.25
+        assert plant.replaced({}).disturbance_names == ("load",)
+
+
 def test_every_type_of_fmi_3_is_set_and_the_end_that_an_fmu_asks_for_is_told(tmp_path):
     path = fmus.make_fmu3(tmp_path)
     largest = {"Int8": 2**7 - 1, "UInt8": 2**8 - 1, "Int16": 2**15 - 1, "UInt16": 2**16 - 1}
@@ -187,9 +201,20 @@ def test_a_plant_that_the_fmu_cannot_be_is_refused_before_anything_of_the_fmu_ru
     assert caught.value.field == field
 
 
-def test_an_array_is_refused_with_its_size(tmp_path):
-    with pytest.raises(InputError, match=r"a variable with one value \(it is an array of 2\)"):
-        FmuPlant(fmus.make_fmu3(tmp_path), ["row"], ["sum"], dt=1.0)
+def test_elements_of_arrays_are_variables_and_whole_arrays_are_none(tmp_path):
+    path = fmus.make_fmu3(tmp_path)
+    start = {"table[1,1]": 10.0, "table[2,3]": 20.0, "row[1]": 0.5}
+    with FmuPlant(
+        path, ["row[2]", "row[1]"], ["table[1,1]", "table[2,3]", "sum"], dt=1.0, start=start
+    ) as plant:
+        assert plant.init().mv.tolist() == [0, 0.5]
+        assert plant.step([3.0, 4.0]).cv.tolist() == [10, 20, 10 + 20 + 3 + 4]
+        assert plant.working_point.tolist() == [0, 0.5]
+    with pytest.raises(InputError, match=r"such as table\[1,1\] \(it is an array of 2 x 3\)"):
+        FmuPlant(path, ["row[1]"], ["table"], dt=1.0)
+    for name in ("row[3]", "row[0]", "row[1,1]", "sum[1]"):
+        with pytest.raises(InputError, match="a variable of the FMU"):
+            FmuPlant(path, ["row[1]"], [name], dt=1.0)
 
 
 @pytest.mark.parametrize(

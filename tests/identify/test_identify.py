@@ -3,7 +3,6 @@
 import dataclasses
 import json
 from pathlib import Path
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +17,10 @@ from identify.well_fmu import WellFmuPlant
 from jaxmpc.controller.schedule import ModelSchedule
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.model.step_response import StepResponseModel
-from jaxmpc.process.plant import JaxPlant, Outputs, Signals, Steady
+from jaxmpc.process.function_plant import FunctionPlant
+from jaxmpc.process.host import HostPlant
+from jaxmpc.process.model_plant import ModelPlant
+from jaxmpc.process.plant import Parameter, Signals
 from jaxmpc.process.well.equations import WellParameters, load_parameters, parameters_to_dict
 from jaxmpc.process.well.grids import SWEEP
 from jaxmpc.process.well.plant import STATE_SCALE, WellPlant, rates, steady_state
@@ -37,49 +39,29 @@ GAIN = np.array([[0.1, 0.0, -0.2], [-0.3, 0.02, 0.0], [0.5, 0.0, 0.4]])  # CV un
 OWN = np.array([10.0, 200.0, 40.0])  # where they start
 
 
-class Tanks(JaxPlant):
-    """Three CVs of first order, 60 s, over three MVs; quadratic in the valve around 40 %."""
-
-    disturbance_names: ClassVar[tuple[str, ...]] = ("rain",)
-    dt: float = 5.0
-    curved: float = 0.0
-
-    def init(self):
-        return self.steady(OWN).state
-
-    def aim(self, mv):
-        return jnp.asarray(GAIN) @ (mv - OWN) + self.curved * (mv[2] - 40.0) ** 2
-
-    def step(self, state, mv, disturbance):
-        cv = state[0] + (1.0 - np.exp(-5.0 / 60.0)) * (self.aim(mv) + jnp.sum(disturbance) - state[0])
-        return (cv, mv), Outputs(cv, mv)
-
-    def measure(self, state):
-        return Outputs(*state)
-
-    def steady(self, mv, disturbance=0.0):
-        cv, mv = self.aim(jnp.asarray(mv)) + disturbance, jnp.asarray(mv)
-        return Steady((cv, mv), Outputs(cv, mv), jnp.asarray(True))
+def aim(u, curved):
+    """Where the CVs go: linear in the MVs, and quadratic in the valve around 40 %."""
+    return jnp.asarray(GAIN) @ (u - OWN) + curved * (u[2] - 40.0) ** 2
 
 
-class OtherTanks:
-    """The same, stepped on the host, without names and steady states."""
-
-    dt, disturbance_names = 5.0, ("rain",)
-
-    def __init__(self):
-        self.plant = Tanks()
-
-    def init(self):
-        self.state = self.plant.init()
-        return self.plant.measure(self.state)
-
-    def step(self, mv, disturbance):
-        self.state, outputs = self.plant.step(self.state, mv, disturbance)
-        return outputs
+def approach(x, u, d, p):
+    """First order, 60 s."""
+    return (aim(u, p["curved"]) + d - x) / 60.0
 
 
-@pytest.mark.parametrize("plant", [Tanks(), OtherTanks()], ids=["JAX", "stateful"])
+def levels(x, u, d, p):
+    """All states."""
+    return x
+
+
+def tanks(curved=0.0):
+    """Three CVs, three MVs and a disturbance that adds to all CVs."""
+    parameters = [Parameter("curved", "1", curved)]
+    given = dict(dt=5.0, mv=OWN, guess=[0.0] * 3, disturbance_names=["rain"], parameters=parameters)
+    return FunctionPlant(approach, levels, **given)
+
+
+@pytest.mark.parametrize("plant", [tanks(), HostPlant(tanks())], ids=["JAX", "stateful"])
 def test_a_plant_of_any_size_and_kind_gives_its_gains_and_time_constant(plant):
     point = {"steam": 250.0, "valve": 20.0, "pump": 11.0}
     found = identify_step_response(
@@ -103,9 +85,26 @@ def test_a_plant_of_any_size_and_kind_gives_its_gains_and_time_constant(plant):
     assert [where[name] for name in TANKS.cv_names] == pytest.approx(GAIN @ [1.0, 50.0, -20.0], abs=1e-3)
 
 
+def test_a_model_that_is_identified_from_its_own_plant_is_that_model(model):
+    both = np.split(np.asarray(model.coefficients), 2, axis=1)
+    known = dataclasses.replace(model, coefficients=both[0], mv_names=("choke",), mv_units=("%",))
+    known = dataclasses.replace(known, dv_coefficients=both[1], dv_names=("gas_lift",), dv_units=("m3/h",))
+    found = identify_step_response(
+        ModelPlant(known), steps=[2.0], samples=250, disturbance_steps={"gas_lift": 100.0}
+    )
+    for key in ("coefficients", "dv_coefficients"):
+        np.testing.assert_allclose(getattr(found, key), getattr(known, key), rtol=1e-9, atol=1e-9)
+    for key in ("cv_names", "mv_names", "dv_names", "cv_units", "mv_units", "dv_units", "dt"):
+        assert getattr(found, key) == getattr(known, key)
+    kept = dict(known.working_point)
+    assert dict(found.working_point) == pytest.approx(
+        {name: kept[name] for name in ("choke", *known.cv_names)}
+    )
+
+
 def test_steps_both_ways_take_the_curvature_out():
     options = dict(steps=(1.0, 5.0, 2.0), samples=100, signals=TANKS)
-    one, both = (identify_step_response(Tanks(curved=0.1), both_ways=way, **options) for way in (False, True))
+    one, both = (identify_step_response(tanks(0.1), both_ways=way, **options) for way in (False, True))
     assert both.coefficients[:, 2, -1] == pytest.approx(GAIN[:, 2], abs=1e-3)
     assert one.coefficients[:, 2, -1] == pytest.approx(GAIN[:, 2] + 0.1 * 2.0, abs=1e-3)
     assert dict(both.provenance)["steps"] == (1.0, 5.0, 2.0, -1.0, -5.0, -2.0)
@@ -113,7 +112,7 @@ def test_steps_both_ways_take_the_curvature_out():
 
 def test_a_sweep_over_two_of_three_mvs_holds_the_third():
     sweep = steady_sweep(
-        Tanks(),
+        tanks(),
         {"valve": [10.0, 20.0, 50.0], "pump": [9.0, 12.0]},
         working_point=[1.0, 300.0, 2.0],
         signals=TANKS,
@@ -125,13 +124,11 @@ def test_a_sweep_over_two_of_three_mvs_holds_the_third():
         sweep.coefficient, np.broadcast_to(GAIN[:, 2, None, None], (3, 2, 2)), atol=1e-12
     )
     with pytest.raises(InputError, match="steady states"):
-        steady_sweep(OtherTanks(), {"valve": [10.0, 20.0], "pump": [9.0]}, signals=TANKS)
+        steady_sweep(HostPlant(tanks()), {"valve": [10.0, 20.0], "pump": [9.0]}, signals=TANKS)
 
 
 def test_a_schedule_of_a_plant_of_three_mvs_is_over_those_that_are_named():
-    schedule = identify_schedule(
-        Tanks(curved=0.01), {"valve": (20.0, 60.0)}, (1.0, 5.0, 2.0), 100, signals=TANKS
-    )
+    schedule = identify_schedule(tanks(0.01), {"valve": (20.0, 60.0)}, (1.0, 5.0, 2.0), 100, signals=TANKS)
     for valve in (20.0, 30.0, 60.0):
         gain = schedule.model_at([0.0, 0.0, valve]).coefficients[:, 2, -1]
         assert np.asarray(gain) == pytest.approx(GAIN[:, 2] + 2 * 0.01 * (valve - 40.0), abs=1e-3)
@@ -239,8 +236,8 @@ def test_model_does_not_depend_on_the_step_size_of_a_linear_plant():
             {"disturbance_steps": {"reservoir_pressure_offset": 0.0}},
             "disturbance_steps.reservoir_pressure_offset",
         ),
-        ({"plant": Tanks()}, "signals"),
-        ({"plant": Tanks(), "signals": TANKS}, "steps"),
+        ({"plant": tanks()}, "signals"),
+        ({"plant": tanks(), "signals": TANKS}, "steps"),
     ],
 )
 def test_bad_step_tests_are_refused_by_name(arguments, field):

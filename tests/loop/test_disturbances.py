@@ -1,50 +1,27 @@
 """Measured disturbances and known setpoints in closed loops, on a plant that is the model itself."""
 
-from typing import Any
+import dataclasses
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxmpc.loop.reference import Reference
 
 from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.errors import InputError
 from jaxmpc.loop.simulate import simulate, simulate_batch
-from jaxmpc.model.step_response import (
-    StepResponseModel,
-    advance_free_response,
-    make_model,
-    shift_free_response,
-)
+from jaxmpc.model.step_response import make_model
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import make_tuning
 from jaxmpc.process.host import HostPlant
-from jaxmpc.process.plant import JaxPlant, Outputs
+from jaxmpc.process.model_plant import ModelPlant
+from jaxmpc.process.reference import Reference
 
 SAMPLES, DT = 70, 10.0  # more than one call of the longest length
-LEVEL, VALVE = jnp.array([50.0]), jnp.array([40.0, 30.0])
+LEVEL, VALVE = np.array([50.0]), np.array([40.0, 30.0])
 
 
-class Itself(JaxPlant):
-    """The model as its own plant: of its disturbances `drift` only adds to the CV, `inflow` is the DV of the model."""
-
-    model: StepResponseModel
-    dt: float = eqx.field(static=True, default=DT)
-    disturbance_names: tuple[str, ...] = eqx.field(static=True, default=("drift", "inflow"))
-
-    def init(self) -> Any:
-        return jnp.zeros((1, 30)), VALVE, jnp.zeros(()), LEVEL
-
-    def step(self, state, mv, disturbance):
-        free, before, inflow, _ = state
-        steps = jnp.concatenate([self.model.coefficients, self.model.dv_coefficients], axis=1)
-        free = advance_free_response(free, steps, jnp.append(mv - before, disturbance[1] - inflow))
-        state = shift_free_response(free), mv, disturbance[1], LEVEL + free[:, 0] + disturbance[0]
-        return state, self.measure(state)
-
-    def measure(self, state):
-        return Outputs(state[3], state[1])
+def plant_of(model):
+    """The model itself: its disturbances are the DV of the model, and what is added to the CV without being measured."""
+    return ModelPlant(model, start={"level": 50.0, "valve": 40.0, "heater": 30.0})
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +55,7 @@ def controllers(models):
 
 def disturbed(size=12.0, at=20):
     rows = np.zeros((SAMPLES, 2))
-    rows[at:, 1] = size
+    rows[at:, 0] = size
     return rows
 
 
@@ -94,7 +71,7 @@ def cost(run):
 def test_a_measured_disturbance_is_rejected_without_bias_and_better_when_it_is_known_ahead(
     models, controllers
 ):
-    plant, rows = Itself(models[1]), disturbed()
+    plant, rows = plant_of(models[1]), disturbed()
     blind, told = (simulate(one, plant, HOLD, disturbance=rows) for one in controllers)
     ahead = simulate(controllers[1], plant, HOLD, disturbance=rows, preview=True)
     assert np.abs(blind.bias_raw).max() > 0.5
@@ -107,7 +84,7 @@ def test_a_measured_disturbance_is_rejected_without_bias_and_better_when_it_is_k
 
 
 def test_a_setpoint_that_is_known_ahead_is_met_halfway(controllers, models):
-    plant = Itself(models[1])
+    plant = plant_of(models[1])
     late, early = (simulate(controllers[1], plant, UP, preview=ahead) for ahead in (False, True))
     assert np.flatnonzero(np.abs(late.move).max(axis=1) > 1e-4)[0] == 30
     assert np.flatnonzero(np.abs(early.move).max(axis=1) > 1e-4)[0] < 30
@@ -116,9 +93,9 @@ def test_a_setpoint_that_is_known_ahead_is_met_halfway(controllers, models):
 
 @pytest.mark.parametrize("preview", [False, True])
 def test_compiled_loops_host_loops_batches_and_single_steps_agree(models, controllers, preview):
-    plant, one = Itself(models[1]), controllers[1]
+    plant, one = plant_of(models[1]), controllers[1]
     rows = disturbed()
-    rows[40:, 0] = 0.7  # this one is not measured
+    rows[40:, 1] = 0.7  # this one is not measured
     how = dict(disturbance=rows, preview=preview)
     compiled, stepped = simulate(one, plant, UP, **how), simulate(one, HostPlant(plant), UP, **how)
     others = np.stack([disturbed(-6.0, 10), rows])
@@ -126,7 +103,7 @@ def test_compiled_loops_host_loops_batches_and_single_steps_agree(models, contro
     _, lane = simulate_batch(lanes, plant, UP, disturbance=others, preview=preview)
     setpoint, horizon = UP.sample(DT), STRUCTURE.prediction_horizon
     whole = lambda v: np.concatenate([v, np.repeat(v[-1:], horizon + 1, axis=0)])  # noqa: E731
-    setpoints, dvs = whole(setpoint), whole(rows[:, 1:])
+    setpoints, dvs = whole(setpoint), whole(rows[:, :1])
     state, process, demands = one.init(LEVEL, VALVE), HostPlant(plant), []
     outputs = process.init()
     for k in range(SAMPLES):
@@ -141,9 +118,9 @@ def test_compiled_loops_host_loops_batches_and_single_steps_agree(models, contro
 
 
 def test_a_disturbance_that_the_plant_lacks_is_refused(models, controllers):
-    plant = Itself(models[1], disturbance_names=("drift", "outflow"))
+    plant = plant_of(dataclasses.replace(models[1], dv_names=("outflow",)))
     for run in (simulate, simulate_batch):
         with pytest.raises(InputError, match=r"^model\.dv: got 'inflow', expected .*outflow"):
             run(controllers[1], plant, HOLD)
         with pytest.raises(InputError, match=r"^preview"):
-            run(controllers[1], Itself(models[1]), HOLD, preview="yes")
+            run(controllers[1], plant_of(models[1]), HOLD, preview="yes")

@@ -1,8 +1,9 @@
 """Many loops on plants that keep their state: each is the loop of its own, and one that fails ends alone."""
 
+import dataclasses
+
 import numpy as np
 import pytest
-from jaxmpc.loop.reference import Reference
 
 from identify.fmu import FmuPlant
 from jaxmpc import status
@@ -10,17 +11,24 @@ from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.controller.measurement import MISSING
 from jaxmpc.errors import PlantError
 from jaxmpc.loop import host_lanes
+from jaxmpc.loop.events import Event
 from jaxmpc.loop.host_lanes import simulate_host_lanes
 from jaxmpc.loop.inputs import Sweep
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.model.step_response import make_model
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import make_tuning
+from jaxmpc.process.actuator import Actuator
+from jaxmpc.process.reference import Reference
 from tests import fmus
 
 SAMPLES, LANES, TOLD = 30, 5, [True, False, True, False, True]
 REFERENCE = Reference([0.0, 50.0], [[0.0], [3.0]], SAMPLES * 10.0)
 NOISE = [0.02]
+EVENTS = [  # one list per lane
+    [Event(10.0 * (3 + k), {"move_weight": 0.05}, mv_off=["u"]), Event(150.0, {"deadzone": 0.1}, mv_on=["u"])]
+    for k in range(LANES)
+]
 
 
 @pytest.fixture(scope="module")
@@ -59,12 +67,20 @@ def run(monkeypatch, structure, model, tunings, path, biases, preview=False):
         plants = [first.replaced({"bias": bias}) for bias in biases]
     loads = np.arange(LANES)[:, None, None] * (np.arange(SAMPLES) > 20)[None, :, None]
     loads = np.asarray(loads, dtype=float)
-    given = {"samples": SAMPLES, "disturbance": loads, "noise": NOISE, "seed": range(LANES), "faults": None}
-    given |= {"position_feedback": TOLD, "preview": preview}
-    sweep = Sweep.checked(controllers, first, [REFERENCE] * LANES, **given)
+    sweep = Sweep.checked(
+        controllers,
+        first,
+        [REFERENCE] * LANES,
+        disturbance=loads,
+        noise=NOISE,
+        seed=range(LANES),
+        position_feedback=TOLD,
+        preview=preview,
+        events=EVENTS,
+    )
     done = []
     fields, failures = simulate_host_lanes(
-        controllers, plants, sweep.inputs_of(np.arange(LANES)), done.append
+        sweep.controllers, plants, sweep.inputs_of(np.arange(LANES)), done.append, sweep.stages
     )
     assert all(plant._process is None for plant in plants)
     assert sum(done) == LANES * SAMPLES
@@ -81,16 +97,12 @@ def test_every_lane_is_the_loop_of_its_controller_and_plant(
     assert failures == {}
     for k, plant in enumerate(plants):
         with plant:
-            own = {
-                "disturbance": loads[k, :, 0],
-                "noise": NOISE,
-                "seed": k,
-                "position_feedback": TOLD[k],
-                "preview": preview,
-            }
+            own = {"disturbance": loads[k, :, 0], "noise": NOISE, "seed": k, "position_feedback": TOLD[k]}
+            own |= {"preview": preview, "events": EVENTS[k]}
             alone = simulate(Controller(structure, tunings[k], model), plant, REFERENCE, **own)
         for name in ("cv", "mv", "mv_demand", "bias", "status"):
             np.testing.assert_allclose(fields[name][k], getattr(alone, name), atol=1e-9, err_msg=name)
+        assert not fields["move"][k, 3 + k : 15].any()
     assert np.ptp(fields["mv"][:, -1]) > 1  # the lanes are not alike
 
 
@@ -132,3 +144,17 @@ def test_a_plant_that_does_not_start_is_a_lane_without_numbers(monkeypatch, stru
     assert list(failures) == [2]
     assert np.isnan(fields["cv"][2]).all()
     assert np.isfinite(fields["cv"][[0, 1, 3, 4]]).all()
+
+
+def test_an_on_off_valve_of_an_fmu_is_an_mv_with_two_values(structure, model, path):
+    valve = dataclasses.replace(structure, mv_names=("b",), prediction_horizon=6, blocks=(1,) * 6)
+    response = make_model(100 * np.asarray(model.coefficients), structure.dt, ["level"], ["b"])
+    limits = {"mv_low": 0.0, "mv_high": 1.0, "move_low": -1.0, "move_high": 1.0}
+    tuning = make_tuning(valve, cv_weight=1.0, move_weight=0.1, **limits)
+    reference = Reference([0.0], [[50.0]], 600.0)
+    on_off = Actuator("on-off", low=0.0, high=1.0)
+    with FmuPlant(path, {"b": on_off}, ["level"], dt=10.0) as plant:
+        run = simulate(Controller(valve, tuning, response), plant, reference)
+    assert set(run.mv[:, 0]) == {0.0, 1.0}
+    np.testing.assert_allclose(run.mv, run.mv_demand, atol=1e-9)
+    assert abs(run.cv[20:].mean() - 50.0) < 3.0

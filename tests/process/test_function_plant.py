@@ -5,7 +5,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxmpc.loop.reference import Reference
 
 from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.errors import InputError, PlantError
@@ -16,8 +15,8 @@ from jaxmpc.problem.tuning import make_tuning
 from jaxmpc.process.actuator import Actuator
 from jaxmpc.process.function_plant import FunctionPlant
 from jaxmpc.process.host import HostPlant
-from jaxmpc.process.named import plant_named
 from jaxmpc.process.plant import Parameter, lanes_of_plants
+from jaxmpc.process.reference import Reference
 
 AREA = Parameter("area", "m2", 2.0, positive=True)
 VALVE = Parameter("valve", "m3/s/m^0.5", 0.1, "conductance of the valve", low=0.0)
@@ -172,46 +171,3 @@ def test_what_does_not_fit_is_refused_by_name(more, field):
 def test_parameters_that_cannot_be_are_refused(values, told):
     with pytest.raises(InputError, match=told):
         tanks().replaced(values)
-
-
-MODULE = """
-from jaxmpc import FunctionPlant
-
-
-def rates(x, u, d, p):
-    return [u[0] - x[0]]
-
-
-def outputs(x, u, d, p):
-    return x
-
-
-def plant():
-    return FunctionPlant(rates, outputs, dt=1.0, mv=[3.0], guess=[0.0])
-
-
-class Own:
-    dt = 5.0
-
-    def init(self): ...
-
-    def step(self, mv, disturbance): ...
-
-
-nothing = dict
-"""
-
-
-def test_a_plant_is_found_by_its_name_in_a_module(tmp_path):
-    (tmp_path / "plants_of_a_test.py").write_text(MODULE)
-    find: Any = lambda name: plant_named(name, tmp_path)  # noqa: E731
-    np.testing.assert_allclose(find("plants_of_a_test:plant").init().x, [3.0])
-    assert find("plants_of_a_test:Own").dt == 5.0
-    for name, told in {
-        "plants_of_a_test:plan": "Did you mean plant?",
-        "plants_of_a_test:nothing": "dict has no dt",
-        "plants_of_another_test:plant": "a module in",
-        "plants_of_a_test": "module:name",
-    }.items():
-        with pytest.raises(InputError, match=told):
-            find(name)

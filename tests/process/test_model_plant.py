@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from jaxmpc.loop.reference import Reference
 
 from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.errors import InputError
@@ -16,6 +15,7 @@ from jaxmpc.process.actuator import Actuator
 from jaxmpc.process.host import HostPlant
 from jaxmpc.process.model_plant import ModelPlant
 from jaxmpc.process.plant import lanes_of_plants
+from jaxmpc.process.reference import Reference
 from tests.conftest import second_order
 
 TO = Reference([0.0, 50.0], [[0.0, 0.0], [400.0, 8.0]], 400.0)
@@ -174,6 +174,10 @@ def test_dead_time_is_taken_away_as_far_as_there_is_some():
     for name in ("dead_time.y.u", "dead_time.y.v", "dead_time"):
         with pytest.raises(InputError, match=r"plant.dead_time.y.[uv]: .* s or more"):
             plant.replaced({name: -21.0})
+    slower = plant.replaced({"time_scale": 2.0, "dead_time.y.u": -40.0})
+    np.testing.assert_array_equal(slower.coefficients[0, 0, :4], [0.5, 1.0, 1.25, 1.5])
+    with pytest.raises(InputError, match=r"plant.dead_time.y.u: got -41.0, expected -40 s or more"):
+        slower.replaced({"dead_time.y.u": -41.0})
 
 
 def test_lanes_of_plants_are_each_plant_alone(well_like_model, small_structure, fields):

@@ -14,6 +14,7 @@ from jaxmpc.controller.case import case_to_dict, make_case
 from jaxmpc.controller.plan import Planner
 from jaxmpc.errors import InputError
 from jaxmpc.process.reference import Reference
+from jaxmpc.process.well.plant import WellPlant
 from studies.bench import forms, instances, peers, rows, run
 from studies.bench.context import Context, Size
 from studies.bench.instances import Recordings, replay

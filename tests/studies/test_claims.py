@@ -12,11 +12,13 @@ import pytest
 from figures.registry import FIGURES
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import make_model
+from studies.definition.catalogue import Comparison
 from studies.definition.comparison import ReferenceDefinition
 from studies.run.comparison import comparison_layout
 from studies.store import fingerprint
 from studies.thesis import catalogue, claims, claims_study
 from studies.thesis.claims import ROWS, record, tables, why
+from studies.thesis.well import WELL
 from tests import studies_synthetic as made
 
 ROW = {row.id: row for row in ROWS}
@@ -39,7 +41,7 @@ def resting(study, extra=None):
     """Finished runs that stand at their setpoints, 50 % and 7500 m3/h, plan no move, and take 1 ms per step."""
     names = [controller.name for controller in study.controllers]
     facts = {"kind": "jax"}, {"jaxmpc": "none"}
-    data = made.empty(comparison_layout(study, model(), lambda: extra or {}, names, "study", *facts))
+    data = made.empty(comparison_layout(study, WELL, model(), lambda: extra or {}, names, "study", *facts))
     data["measurement"].values[:] = data.setpoint.values
     for name, value in {"position": (50.0, 7500.0), "demand": (50.0, 7500.0), "solve_time": 1e-3}.items():
         data[name].values[:] = value
@@ -174,11 +176,7 @@ def judged(data, row):
 
 @pytest.mark.parametrize("study", STUDIES)
 def test_every_row_holds_on_runs_made_to_show_it(study):
-    evidence = claims.Evidence.of(
-        catalogue.comparison_of(
-            study,
-        ).definition
-    )
+    evidence = claims.Evidence.of(STUDIES[study]())
     rows = [row for row in ROWS if row.study == study]
     said = {row.id: claims.judge(row, evidence) for row in rows}
     assert {id: claim.verdict for id, claim in said.items()} == dict.fromkeys(said, "holds")
@@ -448,18 +446,16 @@ def stubbed(tmp_path, monkeypatch):
     ran: list[str] = []
     monkeypatch.setattr(claims_study, "is_current", lambda definition, folder: definition.name in ran)
 
-    def run_named(name, out, quick, plant, **_):
+    def run_thesis(name, out, quick, plant, **_):
         folder = Path(out) / catalogue.comparison_of(name, quick, plant).definition.name
         ran.append(folder.name)
         return folder
 
     def opened(folder):
         study = next(name for name in STUDIES if Path(folder).name == f"{name}-quick-fmu")
-        return catalogue.comparison_of(
-            study,
-        ).definition
+        return STUDIES[study]()
 
-    monkeypatch.setattr(claims_study.catalogue, "run_named", run_named)
+    monkeypatch.setattr(claims_study.catalogue, "run_thesis", run_thesis)
     monkeypatch.setattr(claims_study, "open_results", opened)
     return ran
 
@@ -511,19 +507,19 @@ def test_steps_are_timed_once_and_then_read_from_a_file(tmp_path, monkeypatch):
     store = made.begin(tmp_path, made.layout(hashes=["key"], of=study))
     made.write(store, "continuous-choke", made.trajectory("smooth"))
     made.model().save(tmp_path / "model.json")
-    calls = []
+    calls, made_up = [], Comparison("made-up", study, WELL)
     monkeypatch.setattr(
         claims_study, "step_times", lambda *given: calls.append(given[1]) or np.array([1e-3, 2e-3])
     )
     for _ in range(2):
-        clock = claims_study._Clock(study, tmp_path, tmp_path / "times.json", False, lambda line: None)
+        clock = claims_study._Clock(made_up, tmp_path, tmp_path / "times.json", False, lambda line: None)
         assert clock("continuous-choke").tolist() == [1e-3, 2e-3]
     assert calls == ["continuous-choke"]
     assert json.loads((tmp_path / "times.json").read_text()) == {"key": [1e-3, 2e-3]}
     for damage in ('{"key": [1e-3, 2e', "", "[]", '{"key": ["soon"]}', '{"key": null}'):
         (tmp_path / "times.json").write_text(damage)
         said = []
-        clock = claims_study._Clock(study, tmp_path, tmp_path / "times.json", False, said.append)
+        clock = claims_study._Clock(made_up, tmp_path, tmp_path / "times.json", False, said.append)
         assert clock("continuous-choke").tolist() == [1e-3, 2e-3]
         assert said[0].startswith(f"{tmp_path / 'times.json'} is damaged and is measured anew (")
         assert json.loads((tmp_path / "times.json").read_text()) == {"key": [1e-3, 2e-3]}
@@ -534,7 +530,7 @@ def test_a_run_is_timed_on_the_host_over_its_first_part(monkeypatch):
     from jaxmpc.process.well.plant import WellPlant
 
     monkeypatch.setattr(claims_study, "TIMED", 60.0)
-    study = catalogue.comparison_of("unblocked", True, "jax").definition
+    study = catalogue.comparison_of("unblocked", True, "jax")
     times = claims_study.step_times(study, "blocks", identify_step_response(WellPlant()))
     assert times.shape == (6,)
     assert (times > 0).all()

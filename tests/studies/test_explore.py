@@ -265,6 +265,7 @@ def test_progress_ends_with_all_samples(explored):
 def test_short_times_are_written_in_milliseconds_and_large_numbers_in_full():
     assert written(0.0123, "s") == ("12.3", "ms")
     assert written(1450.0, "s") == ("1,450", "s")
+    assert written(0.0, "s") == ("0", "s")
     assert written(123456.7, "m3") == ("123,457", "m³")
     assert written(3.0, "1") == ("3", "")
     assert written(float("nan"), "1") == ("nan", "")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from figures.registry import FIGURES
+from identify.plants import open_plant
 from identify.schedule import identify_schedule
 from identify.step_test import identify_step_response
 from jaxmpc import status
@@ -15,6 +16,7 @@ from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
 from jaxmpc.problem.tuning import make_tuning
 from jaxmpc.process.well.plant import WellPlant
+from studies.definition.catalogue import Comparison
 from studies.definition.comparison import ComparisonDefinition, ControllerDefinition, ReferenceDefinition
 from studies.run import comparison
 from studies.store.reading import open_results
@@ -118,6 +120,7 @@ def results(model, tmp_path_factory):
     definition = ComparisonDefinition(
         "short",
         "A short run",
+        WELL.name,
         "jax",
         (
             ControllerDefinition("exact", "exact", **made),
@@ -130,9 +133,10 @@ def results(model, tmp_path_factory):
     said = []
     comparison.run_comparison(
         definition,
+        WELL,
         folder,
         model=model,
-        make_plant=lambda actuator: WellPlant(actuator=actuator),
+        make_plant=lambda actual: open_plant(WELL, "jax", actual=actual),
         plant_facts={"kind": "jax"},
         extra=dict,
         schedule=identify_schedule(WellPlant(), {"choke": (20.0, 40.0, 60.0), "gas_lift": (7500.0,)}),
@@ -159,14 +163,14 @@ def test_a_step_that_is_out_of_time_applies_the_best_plan_it_has(results):
 def test_the_replayed_state_of_an_exact_run_gives_its_objectives_again(results, model):
     definition, data = results
     asked = data.assign(status=data.status * 0 + status.LIMIT)  # solve every step again
-    loss = time_limits.objective_loss(asked, definition.controllers[0], model)
+    loss = time_limits.objective_loss(asked, definition.controllers[0], WELL, model)
     assert loss == pytest.approx(np.zeros(len(loss)), abs=3e-6)
 
 
 def test_a_limited_step_loses_no_less_than_nothing_and_no_more_than_its_gap(results, model):
     definition, data = results
     run = data.sel(controller="hurried")
-    loss = time_limits.objective_loss(data, definition.controllers[1], model)
+    loss = time_limits.objective_loss(data, definition.controllers[1], WELL, model)
     limited = run.status.values == status.LIMIT
     gap = run.gap.values[limited]
     assert (loss[~limited] == 0).all()
@@ -176,15 +180,15 @@ def test_a_limited_step_loses_no_less_than_nothing_and_no_more_than_its_gap(resu
 
 def test_the_table_of_limits_has_one_row_per_limited_controller(results, model):
     definition, data = results
-    (row,) = time_limits.limited_steps(data, definition.controllers, model)
+    (row,) = time_limits.limited_steps(data, Comparison("short", definition, WELL), model)
     limited = data.sel(controller="hurried").status.values == status.LIMIT
-    loss = time_limits.objective_loss(data, definition.controllers[1], model)[limited]
+    loss = time_limits.objective_loss(data, definition.controllers[1], WELL, model)[limited]
     assert (row.label, row.share) == ("hurried", pytest.approx(limited.mean()))
     assert row.lost[0] == pytest.approx(np.median(loss))
     assert row.lost[0] <= row.lost[1] <= row.lost[2] == pytest.approx(loss.max())
     solved = data.assign(status=data.status * 0)
-    (none,) = time_limits.limited_steps(solved, definition.controllers, model)
-    text = report.limits_markdown([row, none]).splitlines()
+    (none,) = time_limits.limited_steps(solved, Comparison("short", definition, WELL), model)
+    text = report.limits_table([row, none])
     assert text[2].startswith(f"| hurried | {100 * row.share:.1f} % | ")
     assert text[3] == "| hurried | 0.0 % |  |  |"
 
@@ -201,7 +205,12 @@ def test_a_scheduled_controller_without_a_schedule_is_refused(model):
     definition = catalogue.comparison_of("gain-scheduling", True, "jax").definition
     with pytest.raises(InputError, match="gain schedule"):
         comparison.run_controller(
-            definition.controllers[1], definition, model, lambda actuator: WellPlant(actuator=actuator), False
+            definition.controllers[1],
+            definition,
+            WELL,
+            model,
+            lambda actual: open_plant(WELL, "jax", actual=actual),
+            False,
         )
 
 

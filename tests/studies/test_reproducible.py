@@ -1,14 +1,15 @@
 """Every study of the documentation run twice from nothing: the same numbers, but for times."""
 
+import dataclasses
 import json
 
 import msgspec
 import numpy as np
 import pytest
 
+from studies.run.named import run_named
 from studies.store.reading import open_results
 from studies.thesis import catalogue, claims_study, rto
-from studies.thesis import comparison as thesis
 from studies.thesis.claims import ROWS
 
 pytestmark = pytest.mark.slow
@@ -39,10 +40,11 @@ def test_claims_and_the_results_that_they_are_measured_on(tmp_path):
 
 @pytest.mark.parametrize("study", sorted(set(catalogue.STUDIES) - set(claims_study.NEEDED)))
 def test_a_study_beyond_the_thesis_where_no_clock_stops_a_step(study, tmp_path):
-    definition = catalogue.comparison_of(study, True, "jax").definition
-    unlimited = tuple(controller for controller in definition.controllers if controller.time_limit is None)
-    definition = msgspec.structs.replace(definition, controllers=unlimited)
-    assert_same([thesis.run_definition(definition, tmp_path / which, **QUIET) for which in "ab"])
+    comparison = catalogue.comparison_of(study, True, "jax")
+    unlimited = tuple(one for one in comparison.definition.controllers if one.time_limit is None)
+    definition = msgspec.structs.replace(comparison.definition, controllers=unlimited)
+    comparison = dataclasses.replace(comparison, definition=definition)
+    assert_same([run_named(comparison, tmp_path / which, **QUIET) for which in "ab"])
 
 
 def test_the_real_time_optimisation(tmp_path):

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from jaxmpc.cli.main import main
-from jaxmpc.cli.study import COMPARISONS
+from jaxmpc.cli.study import ALONE
+from studies.definition.catalogue import shipped_comparisons
 from studies.definition.sweep import shipped_studies
 from studies.load import load_study
 from studies.run import runner
@@ -247,7 +248,7 @@ def test_more_scenarios_than_the_limit_need_a_confirmation(file, started, capsys
         (["deadzon"], ["deadzone", "blocking", "mismatch", "robustness"]),
         (["tesis"], ["Did you mean thesis?"]),
         (["fine-regulaton"], ["Did you mean fine-regulation?"]),
-        (["nosuch"], [*COMPARISONS, *shipped_studies(), "a definition file"]),
+        (["nosuch"], [*shipped_comparisons(), *ALONE, *shipped_studies(), "a definition file"]),
         (["nosuch.toml"], ["nosuch.toml", "definition file"]),
     ],
 )
@@ -375,7 +376,7 @@ def test_one_scenario_is_run_again_saved_and_drawn(serial, tmp_path, no_figures,
 def test_a_scenario_of_other_code_is_run_again_with_a_warning(
     serial, tmp_path, no_figures, monkeypatch, capsys
 ):
-    monkeypatch.setattr("studies.definition.models.STEPS", (2.0, 101.0))
+    monkeypatch.setattr("studies.definition.scenarios.code_hash", lambda: "other")
     assert main(["simulate", f"{serial}#0", "--out", str(tmp_path)]) == 0
     assert "jaxmpc: scenario 0 was stored by other code or inputs" in capsys.readouterr().err
 

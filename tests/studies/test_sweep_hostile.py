@@ -9,10 +9,14 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from jaxmpc.errors import InputError
+from jaxmpc.process.well.plant import WellPlant
 from studies.definition.axes import MOST
+from studies.definition.fields import study_fields
 from studies.definition.sweep import StudyDefinition, load_definition
 from studies.load import expand
+from studies.thesis.well import WELL
 
+KEYS = tuple(study_fields(WELL, WellPlant().parameter_table))
 WEIGHT = "tuning.move_weight.choke"
 BODY = tomllib.loads("""
 [study]
@@ -62,7 +66,7 @@ WORDS = st.one_of(
     st.text(max_size=8),
     st.sampled_from(
         [
-            *study_fields(WELL, WellPlant().parameter_table),
+            *KEYS,
             "",
             ".",
             "\x00",

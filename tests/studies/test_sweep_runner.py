@@ -8,7 +8,6 @@ import sys
 import warnings
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 
@@ -20,14 +19,15 @@ from jaxmpc.process.well.plant import WellPlant
 from studies import load
 from studies.definition import scenarios
 from studies.definition.sweep import StudyDefinition
-from studies.kpi.sweep import RECORD, batch_kpis
+from studies.kpi.sweep import RECORD, batch_kpis, measures_of
 from studies.rerun import rerun, study_of
 from studies.run import runner
-from studies.run.chunk import SETTLED, prepare_study, run_chunk, run_scenarios, study_layout
+from studies.run.chunk import prepare_study, run_chunk, run_scenarios, study_layout
 from studies.run.executors import LostError
 from studies.run.runner import RunError, run_study
 from studies.store.reading import chunk_facts, open_study, provenance
 from studies.store.writing import Store
+from studies.thesis.well import WELL
 from tests.sweep_hazards import BODY, computed, preparation, processes
 
 CLOCK = ("solve_time_median", "solve_time_p99", "solve_time_max")  # all that may differ between runs
@@ -91,7 +91,7 @@ def alone(scenario, models):
     """The scenario run by itself: trajectory and key figures."""
     found = simulate(
         Controller(scenario.structure, scenario.tuning, models[scenario.model_point]),
-        WellPlant(parameters=jax.tree.map(np.float64, scenario.plant), actuator=scenario.actuator),
+        WellPlant(actuator=scenario.actuator).replaced(scenario.plant),
         scenario.reference,
         samples=scenario.samples,
         disturbance=scenario.disturbance,
@@ -108,7 +108,9 @@ def alone(scenario, models):
         **{key: getattr(found, key) for key in ("cv_names", "mv_names", "cv_units", "mv_units", "dt")},
     )
     window = scenario.reference.window(scenario.structure.dt, scenario.samples)
-    figures = batch_kpis(batch, stack_tunings([scenario.tuning]), window, tolerance=np.array(SETTLED))
+    figures = batch_kpis(
+        batch, stack_tunings([scenario.tuning]), window, measures_of(WELL), tolerance=WELL.settled
+    )
     return found, {name: values[0] for name, values in figures.items()}
 
 
@@ -145,7 +147,7 @@ def test_scenarios_of_a_study_differ_in_everything_that_may_differ_per_lane(stud
 
 def test_numbers_do_not_depend_on_the_scenarios_that_share_a_chunk(study, prepared):
     options = dict(lanes=3, points=8, every=4, trajectories=("cv", "mv"))
-    options["plant_fields"] = study.varying_plant(0)
+    options |= {"varying": study.varying_plant(0), "process": WELL}
     one, _ = run_scenarios([study.scenario(7)], prepared.models, **options)
     with_others, facts = run_scenarios([study.scenario(k) for k in (7, 1, 2)], prepared.models, **options)
     assert (facts["lanes"], facts["scenarios"]) == (3, 3)
@@ -377,7 +379,7 @@ def test_a_scenario_run_again_has_the_stored_numbers_and_its_title_its_values(nu
 
 
 def test_a_scenario_run_again_by_other_code_is_named_as_such(serial, monkeypatch):
-    monkeypatch.setattr(scenarios.models, "STEPS", (2.0, 101.0))
+    monkeypatch.setattr(scenarios, "code_hash", lambda: "other")
     with pytest.warns(UserWarning, match="scenario 0 was stored by other code"):
         rerun(serial, 0)
 

@@ -14,7 +14,7 @@ from jaxmpc.errors import InputError, MissingToolError
 from studies.definition.models import identify_models
 from studies.definition.sweep import StudyDefinition, shipped_studies
 from studies.kpi.objectives import front, unbeaten
-from studies.kpi.sweep import KPIS
+from studies.kpi.sweep import kpis_of
 from studies.load import expand, load_study
 from studies.run.chunk import run_scenarios, stored_variables
 from studies.search import run as search
@@ -43,7 +43,7 @@ BODY = {
         "prediction_horizon": 30,
         "blocks": [1, 2, 4],
     },
-    "search": {"objectives": ["choke_travel", "deviation"], "batches": 3, "seed": 5},
+    "search": {"objectives": ["travel.choke", "deviation"], "batches": 3, "seed": 5},
     "axes": [
         drawn(WEIGHT, 10, 4000, "log-uniform"),
         {"keys": list(DEADZONE), "values": [[0, 0], [250, 1.25], [1000, 5]]},
@@ -91,7 +91,7 @@ class Quick:
         assert lanes == len(scenarios)
         fields = {
             v.name: np.full((lanes, *(LENGTHS[axis] for axis in v.dims)), 0, v.dtype)
-            for v in stored_variables(trajectories)
+            for v in stored_variables(WELL, trajectories)
         }
         weight = np.array([float(s.tuning.move_weight[0]) for s in scenarios])
         lift = np.array([float(s.tuning.move_weight[1]) for s in scenarios])
@@ -99,13 +99,13 @@ class Quick:
         rest = (
             1 + 9 * np.abs(np.log10(lift / 0.2)) + np.array([float(s.tuning.deadzone[0]) for s in scenarios])
         )
-        fields["choke_travel"] = self.scale * share
+        fields["travel"][:, 0] = self.scale * share
         fields["mean_absolute_deviation"][:] = (rest * (1 - np.sqrt(share / rest)))[:, None]
         fields["complete"][:] = 1
         for lane in range(lanes):
             if (self.computed, lane) in self.failing:
                 fields["complete"][lane] = 0
-                fields["choke_travel"][lane] = -1e9  # would beat everything
+                fields["travel"][lane, 0] = -1e9  # would beat everything
         self.computed += 1
         return fields, {"wall_time": 0.0}
 
@@ -119,7 +119,7 @@ def quick(monkeypatch):
         monkeypatch.setattr(search, "run_scenarios", made)
         return made
 
-    monkeypatch.setattr(search, "identify_models", lambda points: {})
+    monkeypatch.setattr(search, "identify_models", lambda process, points: {})
     put()
     return put
 
@@ -128,12 +128,12 @@ def quick(monkeypatch):
 
 REFUSED = {
     "an objective that does not exist": (
-        {"search": {"objectives": ["choke_travl"]}},
+        {"search": {"objectives": ["travl.choke"]}},
         "search.objectives[0]",
-        "choke_travel",
+        "travel",
     ),
     "an objective of the clock": (
-        {"search": {"objectives": ["choke_travel", "solve_time_p99"]}},
+        {"search": {"objectives": ["travel.choke", "solve_time_p99"]}},
         "search.objectives[1]",
         "clock",
     ),
@@ -148,7 +148,7 @@ REFUSED = {
         "iae.oil_rate",
     ),
     "a channel of a figure without channels": (
-        {"search": {"objectives": ["choke_travel.oil_rate"]}},
+        {"search": {"objectives": ["closed_loop_cost.oil_rate"]}},
         "search.objectives[0]",
         "no channels",
     ),
@@ -290,7 +290,7 @@ def test_tuned_values_are_coordinates_with_units_within_their_bounds(tmp_path, q
     assert pairs == {(0.0, 0.0), (250.0, 1.25), (1000.0, 5.0)}
     table = kpi_frame(path)
     assert list(table.columns[:3]) == [WEIGHT, *DEADZONE]
-    assert provenance(data, "objectives") == {"choke_travel": "minimize", "deviation": "minimize"}
+    assert provenance(data, "objectives") == {"travel.choke": "minimize", "deviation": "minimize"}
 
 
 @pytest.mark.parametrize("sampler", ["nsga2", "tpe"])
@@ -326,7 +326,7 @@ def test_a_damaged_batch_is_computed_again_and_the_later_ones_stay(tmp_path, qui
     made = study(search={"batches": 5})
     path = run(made, tmp_path / "a.zarr")
     whole = results(path)
-    file = path / "choke_travel" / "c.2"
+    file = path / "travel" / "c.2.0"
     file.write_bytes(file.read_bytes()[:-1] + b"x")
     counted = quick()
     run(made, path)
@@ -405,7 +405,7 @@ def test_the_front_is_what_no_scenario_beats_in_the_directions_of_the_search(tmp
     deviation = (
         table["mean_absolute_deviation.gas_rate"] / 1000 + table["mean_absolute_deviation.oil_rate"] / 5
     )
-    points = np.stack([-table["choke_travel"], deviation / 2], axis=1)
+    points = np.stack([-table["travel.choke"], deviation / 2], axis=1)
     wanted = [i for i, p in enumerate(points) if not any((q <= p).all() and (q < p).any() for q in points)]
     best = front(path)
     assert sorted(best.tolist()) == wanted
@@ -441,7 +441,9 @@ def test_a_sampler_beats_points_drawn_at_random(tmp_path, quick, sampler):
         change["study"]["chunk_size"] = size
         path = run(study(**change, search={"batches": batches, "sampler": sampler}), tmp_path / name)
         with open_study(path) as data:
-            points = np.stack([data.choke_travel, data.mean_absolute_deviation.sel(cv="gas_rate")], axis=1)
+            points = np.stack(
+                [data.travel.sel(mv="choke"), data.mean_absolute_deviation.sel(cv="gas_rate")], axis=1
+            )
         return hypervolume(points, (1.1, 11.0))
 
     assert volume("sought.zarr", 12, 12) > 1.03 * volume("random.zarr", 1, 144)  # a first batch is random
@@ -524,11 +526,11 @@ def test_a_stored_scenario_is_the_run_of_its_tuned_values(real):
         scenario = evaluated.scenario(k)
         assert float(scenario.tuning.move_weight[0]) == data[WEIGHT].values[k]
         assert evaluated.scenario_hash(k) == data.scenario_hash.values[k]
-    models = identify_models([evaluated.scenario(7).model_point])
+    models = identify_models(WELL, [evaluated.scenario(7).model_point])
     # with the lanes of the search, which then has its program
-    options = dict(lanes=4, shared_model=True, points=2, every=10, trajectories=())
+    options = dict(lanes=4, shared_model=True, points=2, every=10, trajectories=(), process=WELL)
     fields, _ = run_scenarios([evaluated.scenario(7)], models, **options)
-    for kpi in KPIS:
+    for kpi in kpis_of(WELL):
         if kpi.name not in CLOCK:
             stored = data[kpi.name].values[7]
             np.testing.assert_allclose(fields[kpi.name][0], stored, rtol=1e-6, atol=1e-9, err_msg=kpi.name)
@@ -551,7 +553,7 @@ def test_what_is_found_for_the_well_beats_as_many_points_drawn_at_random(tmp_pat
         with open_study(run(made, tmp_path / name)) as data:
             scale = np.array([1000.0, 5.0])
             deviation = (data.mean_absolute_deviation.values / scale).mean(axis=1)
-            return np.stack([data.choke_travel.values, deviation], axis=1)
+            return np.stack([data.travel.sel(mv="choke").values, deviation], axis=1)
 
     sought, random = points("sought.zarr", 8, 16), points("random.zarr", 1, 128)
     corner = random.max(axis=0)

@@ -15,7 +15,7 @@ from studies.bench.context import Context
 from studies.bench.instances import Kind, Mode, Recording, make_controller
 from studies.bench.judge import taken
 from studies.bench.rows import Goal, Row, timed, whole
-from studies.thesis.well import CHOKE, LIFT, WELL
+from studies.thesis.well import WELL
 
 RUN_SECONDS, RUN_AIM, RUN_SAMPLES = 20.0, 6.0, 7800  # floor and aim of the thesis run
 
@@ -69,7 +69,7 @@ def broken_limits(run: Recording, kind: Kind, mode: Mode, context: Context) -> n
 
 
 def variants(context: Context, integer: bool) -> Row:
-    """Variants advanced together: the move weights of their chokes differ."""
+    """Variants advanced together: the weights of their first moves differ."""
     size, mode = context.size, context.size.modes[0]
     structure = WELL.structure(mode, integer=integer)
     if integer:
@@ -94,5 +94,6 @@ def variants(context: Context, integer: bool) -> Row:
 
 def _tunings(structure: Structure, count: int) -> list[Tuning]:
     weights = np.geomspace(60.0, 2000.0, count).tolist()  # 1/(%)^2
-    changes = ({"move_weight": {CHOKE: weight, LIFT: 0.2}} for weight in weights)
+    stepped, other = WELL.mv_names
+    changes = ({"move_weight": {stepped: weight, other: 0.2}} for weight in weights)
     return [WELL.tuning(structure, changes=change) for change in changes]

@@ -66,7 +66,7 @@ def _opening(context: Context, folder: Path, count: int) -> Row:
     row = _row(
         f"key figures of {count} scenarios as a table", seconds, count, 2.0 if count >= 10_000 else None
     )
-    return _counted(row, (np.asarray(frame["travel.choke"]) == np.arange(count)).sum())
+    return _counted(row, (np.asarray(frame[f"travel.{WELL.mv_names[0]}"]) == np.arange(count)).sum())
 
 
 def _resuming(context: Context, folder: Path, chunks: int) -> Row:
@@ -116,7 +116,7 @@ def _study(chunks: int, samples: int) -> Study:
         "base": {"actuator": "step", "reference": "quick", "duration": 10.0 * samples},
         "axes": [
             {
-                "key": "tuning.move_weight.choke",
+                "key": f"tuning.move_weight.{WELL.mv_names[0]}",
                 "range": {"from": 60.0, "to": 2000.0, "count": CHUNK * chunks, "scale": "log"},
             }
         ],
@@ -135,7 +135,7 @@ def _layout(count: int, size: int) -> StoreLayout:
         scenario_hashes=tuple(str(k) for k in everyone),
         columns=(Column("seed", "seed", "1", everyone.astype(float)),),
         variables=stored_variables(WELL, ()),
-        coords={"cv": (["gas_rate", "oil_rate"], "", "CV"), "mv": (["choke", "gas_lift"], "", "MV")},
+        coords={"cv": (list(WELL.cv_names), "", "CV"), "mv": (list(WELL.mv_names), "", "MV")},
         provenance={},
     )
 
