@@ -46,29 +46,26 @@ def _spans(process: Process) -> np.ndarray:
 
 
 def _pairs(process: Process, model: StepResponseModel) -> list[Finding]:
-    out, scale = [], _spans(process)
-    s = np.asarray(model.coefficients)
+    out: list[Finding] = []
+    s = np.concatenate([np.asarray(model.coefficients), np.asarray(model.dv_coefficients)], axis=1)
+    inputs = {v.name: v for v in (*process.mvs, *process.disturbances)}
+    places = {name: j for j, name in enumerate((*model.mv_names, *model.dv_names))}
     for row in settling(model):
-        i, j = process.cv_names.index(row.cv), process.mv_names.index(row.mv)
-        cv, mv, subject = process.cvs[i], process.mvs[j], f"{row.mv} on {row.cv}"
-        unit = f"{cv.unit} per {mv.unit}" if {cv.unit, mv.unit} - {"", "1"} else ""
+        i, j = process.cv_names.index(row.cv), places[row.mv]
+        cv, mv, subject = process.cvs[i], inputs[row.mv], f"{row.mv} on {row.cv}"
+        unit = "" if cv.unit == mv.unit == "1" else f" {cv.unit} per {mv.unit}"
         peak = np.abs(s[i, j]).max()
-        if peak * scale[i, j] < NOTHING:
-            words = f"no response: at most {peak:.3g} {unit}".rstrip()
-            out.append(
-                Finding("look", subject, f"{words}; if there should be one, look at the model and the spans")
-            )
+        if peak * mv.span / cv.span < NOTHING:
+            words = f"no response: at most {peak:.3g}{unit}; if there should be one, look at the model and the spans"
+            out.append(Finding("look", subject, words))
             continue
         begin = int(np.argmax(np.abs(s[i, j]) > 0.02 * peak))
         rise = (int(np.argmax(np.abs(s[i, j]) >= 0.63 * abs(row.gain))) + 1 - begin) if row.gain else 0
-        words = (
-            f"gain {row.gain:.4g} {unit}".rstrip()
-            + f", dead time {begin * model.dt:g} s, settled after {row.settling_time:g} s"
-        )
+        words = f"gain {row.gain:.4g}{unit}, dead time {begin * model.dt:g} s, settled after {row.settling_time:g} s"
         if not row.settled:
             slope = (s[i, j, -1] - s[i, j, -2]) / model.dt if model.samples > 1 else np.inf
             words = (
-                f"not settled by sample {model.samples}: still moves {slope:.3g} {unit} per second; the prediction holds "
+                f"not settled by sample {model.samples}: still moves {slope:.3g}{unit} per second; the prediction holds "
                 "the last value, so give the model more samples, or a CV that does not integrate"
             )
             out.append(Finding("look", subject, words))
@@ -90,6 +87,14 @@ def _horizons(process: Process, model: StepResponseModel) -> list[Finding]:
     longest = max((row.settling_time for row in settling(model) if row.settled), default=0.0)
     ahead = structure.prediction_horizon * process.dt
     subject = "prediction_horizon"
+    if all(mv.actuator.kind == "on-off" for mv in process.mvs):
+        if structure.prediction_horizon > 1.5 * structure.control_horizon:
+            words = (
+                f"{ahead:g} s, of which {structure.control_horizon * process.dt:g} s are the control horizon: what is on or "
+                "off at its end stays so, and the plan is chosen by that; look less far ahead"
+            )
+            return [Finding("look", subject, words)]
+        return [Finding("fine", subject, f"{ahead:g} s; what is on or off never settles")]
     if ahead < longest:
         words = f"{ahead:g} s; the slowest response settles after {longest:g} s: look further ahead, or expect offset"
         return [Finding("look", subject, words)]
@@ -112,15 +117,18 @@ def _gains(process: Process, model: StepResponseModel) -> list[Finding]:
 def _steps(process: Process, model: StepResponseModel) -> list[Finding]:
     out = []
     gains = np.asarray(model.coefficients)[:, :, -1]
-    zones = process.tuning(process.structure()).deadzone
+    tuning = process.tuning(process.structure())
+    costs = np.asarray(tuning.cv_weight + tuning.soft_quadratic + tuning.soft_linear)
     for j in process.stepped:
         mv = process.mvs[j]
         listed = mv.actuator.listed
         step = mv.actuator.step if listed is None else float(np.diff(listed).max())
         for i, cv in enumerate(process.cvs):
-            effect, zone = abs(gains[i, j]) * float(step or 0.0), float(zones[i])
-            words = f"one step of {amount(step, mv.unit)} moves it by {amount(effect, cv.unit)}"
-            words += f", deadzone +-{amount(zone, cv.unit)}"
+            if not costs[i]:
+                continue  # no setpoint counts
+            effect, zone = abs(gains[i, j]) * float(step or 0.0), float(tuning.deadzone[i])
+            moved, allowed = amount(effect, cv.unit), amount(zone, cv.unit)
+            words = f"one step of {amount(step, mv.unit)} moves it by {moved}, deadzone +-{allowed}"
             if effect > 2 * zone:
                 words += (
                     f": between two steps no position keeps it inside; rounding hunts, whole moves rest off the setpoint, "

@@ -19,7 +19,7 @@ import numpy as np
 from identify.step_test import identify_step_response
 from identify.working_point import facts_of
 from jaxmpc.errors import InputError, near
-from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.model.step_response import StepResponseModel, make_model
 from jaxmpc.process.actuator import Actuator
 from jaxmpc.process.file import process_digest
 from jaxmpc.process.model_plant import ModelPlant
@@ -100,8 +100,7 @@ def plant_facts(process: Process, plant: Any) -> dict[str, Any]:
 def _made(process: Process, source: PlantSource, path: str, actuators: Sequence[Actuator]) -> Any:
     folder = Path(process.folder)
     if source.kind == "model":
-        file = source.source or process.model.file
-        return ModelPlant(load_model(process, file), actuators=tuple(actuators), **source.options)
+        return ModelPlant(load_model(process, source.source), actuators=tuple(actuators), **source.options)
     if source.kind == "fmu":
         from identify.fmu import FmuPlant
 
@@ -138,11 +137,16 @@ def imported(source: str, folder: Path, path: str) -> Any:
 
 
 def load_model(process: Process, file: str = "") -> StepResponseModel:
-    """The model file of a process, which has the CVs and MVs of the process in its order.
+    """The model of a process whose file names it or lists its transfer functions, or another model file.
+
+    Args:
+        file: in place of the model of the process; it has the CVs and MVs of the process in its order.
 
     Raises:
         InputError: naming the field that does not fit.
     """
+    if not file and process.model.responses:
+        return _sampled(process)
     file = file or process.model.file
     model = StepResponseModel.load(Path(process.folder) / file)
     for key, names in (("cv", process.cv_names), ("mv", process.mv_names)):
@@ -154,6 +158,30 @@ def load_model(process: Process, file: str = "") -> StepResponseModel:
     return model
 
 
+def _sampled(process: Process) -> StepResponseModel:
+    """The transfer functions of a process, sampled."""
+    source, units = process.model, process.units
+    times = process.dt * np.arange(1, source.samples + 1)
+    found = {(one.cv, one.of): one.function.step_response(times) for one in source.responses}
+    measured = [d for d in process.disturbance_names if any(one.of == d for one in source.responses)]
+
+    def table(inputs: Sequence[str]) -> list[list[np.ndarray]]:
+        return [[found.get((cv, of), 0.0 * times) for of in inputs] for cv in process.cv_names]
+
+    return make_model(
+        table(process.mv_names),
+        process.dt,
+        process.cv_names,
+        process.mv_names,
+        cv_units=[cv.unit for cv in process.cvs],
+        mv_units=[mv.unit for mv in process.mvs],
+        working_point=source.working_point,
+        dv_coefficients=table(measured) if measured else (),
+        dv_names=measured,
+        dv_units=[units[name] for name in measured],
+    )
+
+
 def signals_in(process: Process) -> Signals:
     """Names and units of a process, as its plants say them."""
     units = [tuple(v.unit for v in own) for own in (process.cvs, process.mvs, process.disturbances)]
@@ -162,13 +190,13 @@ def signals_in(process: Process) -> Signals:
 
 def model_samples(process: Process) -> int:
     """Coefficients of the model of a process."""
-    return load_model(process).samples if process.model.file else process.model.samples
+    return load_model(process).samples if process.model.given else process.model.samples
 
 
 def model_of(
     process: Process, plant: Any = None, working_point: Sequence[float] = (), samples: int | None = None
 ) -> StepResponseModel:
-    """The step-response model of a process: its file, or a step test on its plant.
+    """The step-response model of a process: its file, its transfer functions, or a step test on its plant.
 
     Args:
         plant: for the step test; the first one of the process if not given.
@@ -178,7 +206,7 @@ def model_of(
     Raises:
         InputError: for a working point from which the steps cannot be made.
     """
-    if process.model.file:
+    if process.model.given:
         return load_model(process)
     point = dict(zip(process.mv_names, map(float, working_point), strict=True)) if working_point else {}
     if plant is not None:

@@ -51,7 +51,8 @@ SWEEP_OPTIONS = ("store", "workers", "dask", "dry_run", "yes")
     switch("--yes", "sweeps only: run more scenarios than the confirmation limit of the study", default=None),
     epilog="Comparisons: comparison (of any process, with --process), thesis (three controllers over 78,000 s), soft, "
     "predictions, fine-regulation, disturbance, without-soft, unblocked, gain-scheduling, mean-move, time-limit, rto, "
-    "claims. Sweeps: deadzone, mismatch, blocking, robustness, tune (a search). "
+    "claims. Sweeps: deadzone, mismatch, blocking, robustness, tune (a search); of other shipped processes wood-berry, "
+    "shell-fractionator, quadruple-tank, on-off-heater, pump-tank, step-choke-well. "
     f"A run that is stopped goes on where it was when the same command is given again. {EXITS}",
 )
 def run(options: Options) -> int:

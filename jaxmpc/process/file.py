@@ -23,6 +23,7 @@ from jaxmpc.errors import InputError, near
 from jaxmpc.process.actuator import Actuator
 from jaxmpc.process.process import Cv, KeyFigure, ModelSource, Mv, PlantSource, Process, Variable
 from jaxmpc.process.reference import Reference
+from jaxmpc.process.responses import TransferFunctionSection, responses_of
 
 DEFAULT_PROCESS = "gas-lifted-well"  # of studies that name none
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
@@ -84,6 +85,7 @@ class ModelSection(Section, frozen=True):
     """``[model]``; see `jaxmpc.process.process.ModelSource`."""
 
     file: str = ""
+    transfer_functions: tuple[TransferFunctionSection, ...] = ()
     working_point: Numbers = {}
     steps: Numbers = {}
     disturbance_steps: Numbers = {}
@@ -183,7 +185,7 @@ def process_of(body: Any, folder: str | Path = ".", *, files: bool = True) -> Pr
         mvs=mvs,
         disturbances=tuple(Variable(s.name, s.unit, _label(s), s.span) for s in file.disturbance),
         plants={name: PlantSource(s.kind, s.source, dict(s.options)) for name, s in file.plants.items()},
-        model=ModelSource(**msgspec.structs.asdict(file.model)),
+        model=_model(file),
         structure_fields=_structure_fields(file.structure),
         presets={name: _preset(file.presets, name) for name in file.presets},
         references={
@@ -240,6 +242,10 @@ def _expected(path: str, words: str) -> str:
         "threshold": "MV unit",
         "per": "s",
         "samples": "samples",
+        "gain": "CV unit per MV or disturbance unit",
+        "time_constants": "s",
+        "dead_time": "s",
+        "lead": "s",
     }.get(path.rpartition(".")[2])
     return f"{words} [{unit}]" if unit else words
 
@@ -271,8 +277,9 @@ def _check_names(file: ProcessFile) -> None:
         _require(
             name in mvs, f"model.schedule.{name}", values, f"one of the MVs {', '.join(mvs)}", near(name, mvs)
         )
+    known_points = channels if file.model.transfer_functions else mvs
     for table in ("working_point", "steps", "disturbance_steps"):
-        known = disturbances if table == "disturbance_steps" else mvs
+        known = {"working_point": known_points, "disturbance_steps": disturbances}.get(table, mvs)
         for name, value in getattr(file.model, table).items():
             path = f"model.{table}.{name}"
             _require(name in known, path, value, f"one of {', '.join(known)}", near(name, known))
@@ -287,6 +294,18 @@ def _check_names(file: ProcessFile) -> None:
         for name in getattr(file, table):
             expected = "a letter, then up to 63 letters, digits, '-' and '_'"
             _require(NAME.fullmatch(name), f"{table}.{name}", name, expected)
+
+
+def _model(file: ProcessFile) -> ModelSource:
+    """Where the model comes from."""
+    fields = msgspec.structs.asdict(file.model)
+    table = fields.pop("transfer_functions")
+    both = bool(table and file.model.file)
+    _require(not both, "model.file", file.model.file, "nothing: model.transfer_functions are the model")
+    names = {key: [section.name for section in getattr(file, key)] for key in ("cv", "mv")}
+    loads = [f"output.{name}" for name in names["cv"]]
+    names["dv"] = [section.name for section in file.disturbance if section.name not in loads]
+    return ModelSource(responses=responses_of(table, names), **fields)
 
 
 def _label(section: Any) -> str:
@@ -427,7 +446,8 @@ def _check_plants(process: Process) -> None:
             found = (Path(process.folder) / plant.source).is_file() and plant.source
             _require(found, path, plant.source, f"a file, relative to {process.folder}")
         else:
-            _require(process.model.file, "model.file", "", f"a model file: plants.{name} is that model")
+            expected = f"a model file, or transfer_functions: plants.{name} is that model"
+            _require(process.model.given, "model.file", "", expected)
     file = process.model.file
     if file:
         found = (Path(process.folder) / file).is_file()

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxmpc.errors import InputError, near
+from jaxmpc.model.transfer_function import TransferFunction
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS, Tuning, make_tuning
 from jaxmpc.process.actuator import Actuator
@@ -74,13 +75,22 @@ class PlantSource:
 
 
 @dataclasses.dataclass(frozen=True)
+class Response:
+    """The response of a CV to an MV or a measured disturbance [CV unit per its unit, seconds]."""
+
+    cv: str
+    of: str
+    function: TransferFunction
+
+
+@dataclasses.dataclass(frozen=True)
 class ModelSource:
-    """Where the step-response model comes from: a file, or a step test on the plant."""
+    """Where the step-response model comes from: a file, transfer functions, or a step test on the plant."""
 
     file: str = ""
-    working_point: dict[str, float] = dataclasses.field(
-        default_factory=dict
-    )  # of the step test, by MV [MV unit]
+    responses: tuple[Response, ...] = ()  # transfer functions; pairs that are not listed do not respond
+    # of the step test, by MV [MV unit]; of transfer functions, what CVs and MVs deviate from, 0 where not given
+    working_point: dict[str, float] = dataclasses.field(default_factory=dict)
     steps: dict[str, float] = dataclasses.field(default_factory=dict)  # sizes of its steps, by MV [MV unit]
     disturbance_steps: dict[str, float] = dataclasses.field(
         default_factory=dict
@@ -88,6 +98,11 @@ class ModelSource:
     # positions of one or two MVs at which the models of a gain schedule are identified [MV unit]
     schedule: dict[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
     samples: int = 250  # coefficients
+
+    @property
+    def given(self) -> bool:
+        """Whether it needs no step test."""
+        return bool(self.file or self.responses)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,17 +198,18 @@ class Process:
         """Of the MVs; where they are not the actual ones, they take every value between the same limits."""
         return tuple(mv.actuator if actual else Actuator(low=mv.low, high=mv.high) for mv in self.mvs)
 
-    def structure(self, blocking: str = "moves", *, integer: bool = False, **changes: Any) -> Structure:
+    def structure(self, blocking: str = "", *, integer: bool = False, **changes: Any) -> Structure:
         """The default structure.
 
         Args:
-            blocking: meaning of a block, or ``none`` for single moves.
+            blocking: meaning of a block, or ``none`` for single moves; that of the process if not given.
             integer: whether MVs with stepped actuators move in whole steps or among their values.
             **changes: further fields of `Structure`.
 
         Raises:
             InputError: naming the field.
         """
+        blocking = blocking or self.structure_fields.get("blocking", BLOCKING[0])
         if blocking not in BLOCKING:
             raise InputError("structure.blocking", blocking, "'moves', 'inputs' or 'none'")
         given = dict(self.structure_fields)

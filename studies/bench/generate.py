@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxmpc.controller.case import Case
 from jaxmpc.model.step_response import make_model
+from jaxmpc.model.transfer_function import TransferFunction
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning, make_tuning
 
@@ -37,17 +38,9 @@ def shipped_cases() -> dict[str, Case]:
 
 
 def step_response(row: list[float], times: np.ndarray) -> np.ndarray:
-    """Of one transfer function: gain, dead time, and lags that all differ or are all infinite (integrators)."""
+    """Of one transfer function: gain, dead time, and lags, of which infinite ones are integrators."""
     gain, dead, *lags = row
-    t, order = np.maximum(times - dead, 0.0), len(lags)
-    if math.inf in lags:
-        return gain * t**order / math.factorial(order)
-    response = np.ones(len(t))
-    for lag in lags:
-        response -= (
-            lag ** (order - 1) / math.prod(lag - other for other in lags if other != lag) * np.exp(-t / lag)
-        )
-    return gain * response
+    return TransferFunction(gain, tuple(lags), dead).step_response(times)
 
 
 def _case(process: dict, family: dict, rng: random.Random) -> Case:

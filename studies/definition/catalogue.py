@@ -95,7 +95,8 @@ def _comparison(path: Path, told: dict[str, Any], quick: bool, plant: str, given
     short, controllers = told.pop("quick", {}), told.get("controllers")
     if not isinstance(controllers, list) or not controllers:
         raise InputError("controllers", controllers, "one table or more, each headed [[controllers]]")
-    runs = [INTEGER | one if isinstance(one, dict) else one for one in controllers]
+    usual = INTEGER | {"blocking": process.structure().blocking}
+    runs = [usual | one if isinstance(one, dict) else one for one in controllers]
     if quick:
         asked = short.get("controllers", [one["name"] for one in runs])
         runs = [one for one in runs if one["name"] in asked]

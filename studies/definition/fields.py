@@ -198,9 +198,10 @@ def _controller_fields(process: Process) -> list[Field]:
         shaping("mean_move_window"),
         shaping("mean_move_mode"),
     ]
-    for mv in process.mvs:
+    dwells = (process.stepped and defaults.get("dwell")) or (1,) * len(process.mvs)
+    for mv, dwell in zip(process.mvs, dwells, strict=True):
         values = dict(kind="values", unit=mv.unit, low=-math.inf, high=math.inf, default=None)
-        for field in (shaping("integer_values", **values), shaping("dwell", default=1)):
+        for field in (shaping("integer_values", **values), shaping("dwell", default=dwell)):
             label = structure[field.key].meaning.format(f"the {mv.label}")
             out.append(dataclasses.replace(field, key=f"{field.key}.{mv.name}", label=label))
     return out
@@ -224,9 +225,9 @@ def _tuning_fields(process: Process) -> list[Field]:
 
 
 def _model_fields(process: Process) -> list[Field]:
-    """The working point of the step test; nothing to choose where the model is a file."""
+    """The working point of the step test; nothing to choose where there is none."""
     out = []
-    for mv in process.mvs if not process.model.file else ():
+    for mv in process.mvs if not process.model.given else ():
         step = abs(process.model.steps[mv.name])  # the step test goes that far, and stays within the range
         label, at = f"{mv.label} of the model's working point", process.model.working_point[mv.name]
         out.append(Field(f"model.{mv.name}", label, mv.unit, default=at, low=mv.low, high=mv.high - step))

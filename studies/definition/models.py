@@ -13,7 +13,7 @@ from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.process import Process
 from studies.definition.refusing import require
 
-Point = tuple[float, ...]  # a value per MV [MV unit]; empty where the model is a file
+Point = tuple[float, ...]  # a value per MV [MV unit]; empty where the model is given
 
 
 def identify_models(
@@ -29,7 +29,7 @@ def identify_models(
             steady state; before any model is identified.
     """
     wanted = list(dict.fromkeys(tuple(map(float, point)) for point in points))
-    plant = None if process.model.file else open_plant(process, actual=False)
+    plant = None if process.model.given else open_plant(process, actual=False)
     steps = np.array([process.model.steps.get(mv.name, 0.0) for mv in process.mvs])
     for point in wanted if plant is not None else ():
         named = zip(process.mvs, point, strict=True)

@@ -141,7 +141,7 @@ def resolve(definition: StudyDefinition, table: AxisTable) -> Inputs:
         variant=variant,
         tuning=_tuning(settings, kinds[variant] if len(set(kinds)) > 1 else kinds[:1]),
         plant=_plant(settings),
-        point=settings.columns([f"model.{name}" for name in process.mv_names if not process.model.file]),
+        point=settings.columns([f"model.{name}" for name in process.mv_names if not process.model.given]),
         noise=settings.columns([f"noise.{name}" for name in process.cv_names]),
         seed=settings.numbers("seed").astype(np.int64),
         step_names=tuple(
@@ -188,9 +188,10 @@ def _structure(settings: Settings, k: int) -> Structure:
     """The structure of one scenario; without a control horizon the blocks decide it."""
     value = lambda key: settings.value(key, k)  # noqa: E731
     blocks, blocking = value("blocks"), value("blocking")
-    horizon = value("control_horizon") or sum(blocks[0] if isinstance(blocks[0], tuple) else blocks)
     process = settings.definition.process
     base = process.structure("moves", integer=value("controller") == "mixed-integer")
+    of_one = blocks[0] if blocks and isinstance(blocks[0], tuple) else blocks
+    horizon = value("control_horizon") or sum(of_one) or base.control_horizon
     own: dict[str, Any] = {}
     if base.integer_mvs:
         given = [value(f"integer_values.{name}") for name in process.mv_names]

@@ -187,9 +187,9 @@ def load_definition(name_or_path: str | Path, process: str | Path | None = None)
 
 
 def shipped_studies() -> dict[str, Path]:
-    """Definitions that come with the package, by name."""
-    folder = Path(str(resources.files("studies")))
-    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+    """Definitions that come with the package, by name: of the well, then one for each other process of the library."""
+    root = Path(str(resources.files("studies")))
+    return {path.stem: path for folder in (root, root / "library") for path in sorted(folder.glob("*.toml"))}
 
 
 # ------------------------------------------------------------------------------------------------------- decoding

@@ -17,7 +17,6 @@ from studies.bench import folder, peers, run
 from studies.bench.context import QUICK, Context
 from studies.bench.folder import Known, faults, shipped, solve
 from studies.bench.forms import lifted
-from studies.bench.generate import step_response
 from studies.bench.judge import FEASIBLE, Judge, performance_profile
 from studies.bench.problem import objective, violation
 
@@ -92,16 +91,6 @@ def test_the_certified_optimum_of_a_small_instance_is_found(name):
     _, plan = solve(case, 60.0)
     assert plan.status == "optimal"
     assert faults(case_to_dict(case), KNOWN[name], plan) == []
-
-
-def test_step_responses_are_those_of_their_transfer_functions():
-    t = np.array([0.5, 1.0, 3.0, 10.0])
-    np.testing.assert_allclose(
-        step_response([2.0, 1.0, 4.0], t), 2.0 * (1 - np.exp(-np.maximum(t - 1, 0) / 4))
-    )
-    np.testing.assert_allclose(step_response([3.0, 0.0, math.inf, math.inf], t), 3.0 * t**2 / 2)
-    two = 1 - (5.0 * np.exp(-t / 5.0) - 2.0 * np.exp(-t / 2.0)) / 3.0
-    np.testing.assert_allclose(step_response([1.0, 0.0, 5.0, 2.0], t), two)
 
 
 # --------------------------------------------------------------------------------- what is said of answers
