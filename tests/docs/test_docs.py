@@ -1,18 +1,21 @@
 """The documentation: its Python runs, its links and anchors resolve, it knows every figure and study, the site builds.
 
 A block whose title begins with "Needs a C compiler" runs where there is one; any other block that needs something is not
-run. The blocks of a page run in order, in one namespace, in a folder of their own.
+run. The blocks of a page run in order, in one namespace, in a folder of their own. A block with the name of a file as its
+title is written there; "FILE, changed" replaces tables of it that begin alike; commands run where the title is "Runs".
 """
 
 import argparse
 import json
 import re
+import shlex
 import shutil
 import subprocess
 import sys
 import tomllib
 import unicodedata
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -28,7 +31,12 @@ DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
 NOTEBOOK = ROOT / "studies" / "notebooks" / "tour.ipynb"
 FENCE = re.compile(r"^```(\w+)[ \t]*([^\n]*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-QUICK = {"reading-a-plan.md", "mathematics.md"}  # the other pages with Python take more than 20 s
+FILE = re.compile(r"([\w.-]+\.(?:toml|json|py))(, changed)?")
+QUICK = {
+    "reading-a-plan.md",
+    "mathematics.md",
+    "processes.md",
+}  # the other pages with Python take more than 20 s
 COMPILER = "Needs a C compiler"
 
 
@@ -43,45 +51,90 @@ def title(options: str) -> str:
     return found[1] if found else ""
 
 
-def python_blocks(path: Path) -> list[tuple[str, str, int]]:
-    """``(title, code, line)`` of the Python blocks of a page."""
+class Block(NamedTuple):
+    """A block of code."""
+
+    language: str
+    title: str
+    code: str
+    line: int
+
+    @property
+    def runs(self) -> bool:
+        """Whether it does something in the order of its page."""
+        if self.language == "python":
+            return not self.title.startswith("Needs") or self.title == COMPILER
+        return bool(FILE.fullmatch(self.title)) or self.title == "Runs" or self.title == f"Runs. {COMPILER}"
+
+    @property
+    def compiles(self) -> bool:
+        """Whether that takes a C compiler."""
+        return self.title.endswith(COMPILER)
+
+
+def blocks_of(path: Path) -> list[Block]:
+    """The blocks of a page."""
     text = path.read_text()
     return [
-        (title(found[2]), found[3], text.count("\n", 0, found.start()) + 1)
+        Block(found[1], title(found[2]), found[3], text.count("\n", 0, found.start()) + 1)
         for found in FENCE.finditer(text)
-        if found[1] == "python"
     ]
 
 
 def running() -> list:
-    """Pages with Python that runs, the long ones marked."""
+    """Pages with Python or commands that run, the long ones marked."""
     marks = lambda path: [] if path.name in QUICK else [pytest.mark.slow]  # noqa: E731
     return [
         pytest.param(path, marks=marks(path), id=name_of(path))
         for path in PAGES
-        if any(not needs.startswith("Needs") or needs == COMPILER for needs, _, _ in python_blocks(path))
+        if any(block.runs and block.language in ("python", "sh") for block in blocks_of(path))
     ]
 
 
+def changed(text: str, changes: str) -> str:
+    """A file in which tables, parted by empty lines, are replaced by those that begin alike."""
+    parts = text.strip().split("\n\n")
+    for new in changes.strip().split("\n\n"):
+        head = re.match(r"\[\[\w+\]\]\nname = .*|\[.*?\]", new)[0]
+        (at,) = (k for k, part in enumerate(parts) if part.startswith(head))
+        parts[at] = new
+    return "\n\n".join([*parts, ""])
+
+
+def run(block: Block, page: Path, namespace: dict) -> None:
+    """Write the file, run the commands or run the Python of a block."""
+    if file := FILE.fullmatch(block.title):
+        here = Path(file[1])
+        here.write_text(changed(here.read_text(), block.code) if file[2] else block.code)
+    elif block.language == "python":
+        exec(compile("\n" * block.line + block.code, str(page), "exec"), namespace)
+    else:
+        for line in block.code.splitlines():
+            words = shlex.split(line, comments=True)
+            assert words[0] == "jaxmpc"
+            assert cli.main(words[1:]) == 0, f"{page.name}: {line}"
+
+
 @pytest.mark.parametrize("page", running())
-def test_the_python_of_a_page_runs_as_typed(page, tmp_path, monkeypatch):
-    blocks = python_blocks(page)
-    if any(needs == COMPILER for needs, _, _ in blocks) and not (
+def test_the_python_and_the_commands_of_a_page_run_as_typed(page, tmp_path, monkeypatch):
+    blocks = [block for block in blocks_of(page) if block.runs]
+    if any(block.compiles for block in blocks) and not (
         shutil.which("make") and any(map(shutil.which, ("cc", "gcc", "clang")))
     ):
         pytest.skip("no C compiler")
     monkeypatch.chdir(tmp_path)
     namespace = {"__name__": "__main__"}
-    for needs, code, line in blocks:
-        if not needs.startswith("Needs") or needs == COMPILER:
-            exec(compile("\n" * line + code, str(page), "exec"), namespace)
+    for block in blocks:
+        run(block, page, namespace)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_python_that_does_not_run_says_what_it_needs_and_is_python(page):
-    for needs, code, line in python_blocks(page):
-        assert not needs or re.fullmatch(r"Needs [a-zA-Z].+", needs), f"{page.name}:{line}"
-        compile(code, f"{page.name}:{line}", "exec")
+    for block in blocks_of(page):
+        if block.language == "python":
+            said = not block.title or re.fullmatch(r"Needs [a-zA-Z].+", block.title)
+            assert said or FILE.fullmatch(block.title), f"{page.name}:{block.line}"
+            compile(block.code, f"{page.name}:{block.line}", "exec")
 
 
 def command(words: list[str]) -> tuple[argparse.ArgumentParser, list[str]]:
@@ -95,7 +148,8 @@ def command(words: list[str]) -> tuple[argparse.ArgumentParser, list[str]]:
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_commands_of_a_page_exist_with_their_options(page):
     for words in re.findall(
-        r"\bjaxmpc ((?:plan|fmu|identify|study|simulate|figures|bench)\b[^`\n]*)", page.read_text()
+        r"\bjaxmpc ((?:plan|fmu|identify|process|study|simulate|figures|explore|bench)\b[^`\n]*)",
+        page.read_text(),
     ):
         words = re.split(r"\s+#|\s{2,}|[;|&]", words)[0].replace("'", "")
         parser, _ = command(words.split())
@@ -115,11 +169,10 @@ def test_studies_that_are_named_in_commands_are_shipped():
 
 def test_study_files_of_the_pages_are_accepted():
     count = 0
-    for page in PAGES:
-        for found in FENCE.finditer(page.read_text()):
-            if found[1] == "toml" and "[study]" in found[3]:
-                expand(StudyDefinition.from_dict(tomllib.loads(found[3])))
-                count += 1
+    for block in (block for page in PAGES for block in blocks_of(page)):
+        if block.language == "toml" and "[study]" in block.code and not block.runs:
+            expand(StudyDefinition.from_dict(tomllib.loads(block.code)))
+            count += 1
     assert count >= 3
 
 

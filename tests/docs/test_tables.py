@@ -4,11 +4,14 @@ import dataclasses
 import re
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from jaxmpc.problem.declared import declared
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
+from jaxmpc.process import file
+from jaxmpc.process.responses import TransferFunctionSection
 from studies.definition.fields import study_fields
 from studies.thesis.well import WELL
 
@@ -66,6 +69,20 @@ TABLES = {
 }
 
 
+SECTIONS = {  # tables of a process file by their headings in processes.md
+    "### At the top": file.ProcessFile,
+    "### `[[cv]]`: controlled variables": file.CvSection,
+    "### `[[mv]]`: manipulated variables": file.MvSection,
+    "### `actuator`: what becomes of a demand": file.ActuatorSection,
+    "### `[[disturbance]]`: what else moves the CVs": file.VariableSection,
+    "### `[model]`: what the controller predicts with": file.ModelSection,
+    "### `transfer_functions`: entries of the list": TransferFunctionSection,
+    "### `[plants.NAME]`: what is controlled": file.PlantSection,
+    "### `[references.NAME]` and `[disturbances.NAME]`: over time": file.WindowsSection,
+    "### `[[key_figure]]`: integrals of your own": file.KeyFigureSection,
+}
+
+
 def parts(page: str, heading: str) -> tuple[str, str, str]:
     """A page before, in and after the first table below a heading."""
     text = (DOCS / page).read_text()
@@ -78,6 +95,18 @@ def parts(page: str, heading: str) -> tuple[str, str, str]:
 @pytest.mark.parametrize(("page", "heading"), TABLES)
 def test_a_table_of_fields_says_what_their_declarations_say(page, heading):
     assert parts(page, heading)[1] == TABLES[page, heading]()
+
+
+@pytest.mark.parametrize(("heading", "section"), SECTIONS.items())
+def test_the_page_of_processes_has_every_key_with_its_default(heading, section):
+    rows = [line.split("|")[1:5] for line in parts("processes.md", heading)[1].splitlines()[2:]]
+    told = {key.strip(" `"): default.strip(" `") for key, _, default, _ in rows}
+    fields = msgspec.structs.fields(section)
+    assert set(told) == {field.name for field in fields}
+    for field in fields:
+        assert (told[field.name] == "required") == field.required, field.name
+        if isinstance(field.default, (int, float)) and field.name != "settled":  # which 0 leaves to the span
+            assert told[field.name] == f"{field.default:g}"
 
 
 @pytest.mark.parametrize("kind", [Structure, Tuning])

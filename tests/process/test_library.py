@@ -217,7 +217,7 @@ def test_what_is_on_or_off_keeps_its_dwell_and_its_cv_near_the_setpoint(name, go
 def written():
     """The process file of the documentation."""
     text = (DOCS / "processes.md").read_text()
-    return tomllib.loads(text.split("```toml", 1)[1].split("```", 1)[0])
+    return tomllib.loads(text.split('```toml title="heat-exchanger.toml"\n', 1)[1].split("```", 1)[0])
 
 
 def test_the_file_of_the_documentation_is_a_process():
