@@ -49,7 +49,8 @@ class FmuPlant:
         disturbances: names of variables that are disturbed, or their undisturbed values by name; by default those that they
             start with. The loop gives how far off they are.
         dt: sampling interval [s].
-        start: start values and parameters by name; enumerations by name or value.
+        variables: variables of the FMU by the names of MVs, CVs and disturbances that are called otherwise in it.
+        start: start values and parameters by their names in the FMU; enumerations by name or value.
         working_point: of MVs by name, if not their start values.
         positions: variables by MV that tell where its actuator stands; it is where the demand moves it if not given.
         substep: step of the FMU [s], a whole number of them in `dt`; by default its own, or that of its default experiment.
@@ -79,6 +80,7 @@ class FmuPlant:
         disturbances: Sequence[str] | Mapping[str, Value] = (),
         *,
         dt: float,
+        variables: Mapping[str, str] | None = None,
         start: Mapping[str, Value] | None = None,
         working_point: Mapping[str, Value] | None = None,
         positions: Mapping[str, str] | None = None,
@@ -109,6 +111,7 @@ class FmuPlant:
             self._check_description()
             self._substep, self._count = self.description.step_of(self.dt, substep)
             self._settle = math.ceil(settle / self._substep - 1e-9)
+            self._variables = dict(variables or {})
             self._take_start(start or {})
             self._take_mvs(mv, working_point or {}, positions or {})
             self._take_cvs(cv)
@@ -144,7 +147,10 @@ class FmuPlant:
                     expected = f"one of the MVs {', '.join(actuators)}"
                     raise InputError(f"plant.{field}", name, expected, near(name, actuators))
         self.working_point = np.array(
-            [self._rest("plant.working_point", found, working_point) for found in self._mvs]
+            [
+                self._rest("plant.working_point", name, found, working_point)
+                for name, found in zip(self.mv_names, self._mvs, strict=True)
+            ]
         )
         self._positions = {
             self.mv_names.index(name): self._read("plant.positions", told).name
@@ -153,22 +159,22 @@ class FmuPlant:
 
     def _take_cvs(self, cv: Sequence[str]) -> None:
         self.cv_names = _names("plant.cv", cv)
-        for name in self.cv_names:
-            self._read("plant.cv", name)
-        self._outputs = (*self.cv_names, *self._positions.values())
+        self._cvs = [self._read("plant.cv", name) for name in self.cv_names]
+        self._outputs = (*(found.name for found in self._cvs), *self._positions.values())
 
     def _take_disturbances(self, disturbances: Any) -> None:
         given = disturbances if isinstance(disturbances, Mapping) else {}
         self.disturbance_names = _names("plant.disturbances", disturbances)
         self._disturbed = [self._moved("plant.disturbances", name) for name in self.disturbance_names]
-        twice = set(self.disturbance_names) & set(self.mv_names)
+        twice = {v.name for v in self._disturbed} & {v.name for v in self._mvs}
         if twice:
             raise InputError("plant.disturbances", min(twice), "a variable that is no MV")
-        self._undisturbed = np.array([self._rest("plant.disturbances", v, given) for v in self._disturbed])
+        found = zip(self.disturbance_names, self._disturbed, strict=True)
+        self._undisturbed = np.array([self._rest("plant.disturbances", name, v, given) for name, v in found])
 
     def _moved(self, field: str, name: str) -> FmuVariable:
         """A variable that is set while the FMU runs."""
-        found = self.description.variable(field, name)
+        found = self.description.variable(field, self._variables.get(name, name))
         if not found.movable or found.type not in NUMBERS:
             expected = f"an input or a tunable parameter that holds a number (this is {_kind(found)})"
             raise InputError(field, name, expected)
@@ -176,18 +182,18 @@ class FmuPlant:
 
     def _read(self, field: str, name: str) -> FmuVariable:
         """A variable that is measured."""
-        found = self.description.variable(field, name)
+        found = self.description.variable(field, self._variables.get(name, name))
         if found.causality not in ("output", "local") or found.type not in NUMBERS:
             expected = f"an output or a local variable that holds a number (this is {_kind(found)})"
             raise InputError(field, name, expected)
         return found
 
-    def _rest(self, field: str, found: FmuVariable, given: Mapping[str, Value]) -> float:
+    def _rest(self, field: str, name: str, found: FmuVariable, given: Mapping[str, Value]) -> float:
         """The value of a moved variable at rest: the given one, or that which it starts with."""
-        name = found.name
         if name in given:
             return float(found.exactly(f"{field}.{name}", given[name]))
-        value = float(self._start_values[name]) if name in self._start_values else found.number
+        start = self._start_values.get(found.name)
+        value = found.number if start is None else float(start)
         if value is None:
             raise InputError(f"{field}.{name}", "nothing", f"{found.expected}: the FMU has no start value")
         return value
@@ -234,7 +240,7 @@ class FmuPlant:
 
     def _inputs(self, moved: Sequence[Value], disturbance: Any) -> dict[str, Value]:
         """What is given to the FMU with the actuators at these positions."""
-        given = dict(zip(self.mv_names, moved, strict=True))
+        given = {v.name: value for v, value in zip(self._mvs, moved, strict=True)}
         off = np.asarray(disturbance, dtype=np.float64)
         if off.shape not in ((), self._undisturbed.shape):
             expected = f"one number, or one each for {', '.join(self.disturbance_names) or 'no disturbance'}"
@@ -306,15 +312,14 @@ class FmuPlant:
     @property
     def signals(self) -> Signals:
         """Names and units of its CVs, MVs and disturbances."""
-        names = self.cv_names, self.mv_names, self.disturbance_names
-        units = (tuple(self.description.variables[name].unit or "" for name in some) for some in names)
+        units = (tuple(v.unit or "" for v in own) for own in (self._cvs, self._mvs, self._disturbed))
         return Signals(self.cv_names, self.mv_names, *units)
 
     def facts(self) -> dict[str, Any]:
         """What the plant is, with a digest of everything that decides its responses."""
         how = (
             (self.mv_names, self._actuators, self.working_point.tolist(), self._positions),
-            (self.cv_names, self.disturbance_names, self._undisturbed.tolist()),
+            (self.cv_names, self.disturbance_names, self._undisturbed.tolist(), self._variables),
             (sorted(self._start_values.items()), self._substep, self._count, self._settle, self._stop),
         )
         digest = hashlib.sha256(self.path.read_bytes() + repr(how).encode())

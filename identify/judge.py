@@ -12,12 +12,12 @@ from scipy.optimize import lsq_linear
 
 from identify.step_test import settling
 from jaxmpc.model.step_response import StepResponseModel
-from jaxmpc.process.process import Process
+from jaxmpc.process.process import Process, amount
 
 NOTHING = 1e-4  # spans of a CV per span of an MV: no response
 FAST, SLOW = 3, 0.9  # samples to 63 % of a gain; share of the model's length
 ILL = 30.0  # condition number of the gains in spans from which on directions differ much
-Level = Literal["fine", "look", "wrong"]
+Level = Literal["fine", "look"]
 
 
 class Finding(NamedTuple):
@@ -56,7 +56,8 @@ def _pairs(process: Process, model: StepResponseModel) -> list[Finding]:
         unit = "" if cv.unit == mv.unit == "1" else f" {cv.unit} per {mv.unit}"
         peak = np.abs(s[i, j]).max()
         if peak * mv.span / cv.span < NOTHING:
-            out.append(Finding("look", subject, f"no response: at most {peak:.3g}{unit}"))
+            words = f"no response: at most {peak:.3g}{unit}; if there should be one, look at the model and the spans"
+            out.append(Finding("look", subject, words))
             continue
         begin = int(np.argmax(np.abs(s[i, j]) > 0.02 * peak))
         rise = (int(np.argmax(np.abs(s[i, j]) >= 0.63 * abs(row.gain))) + 1 - begin) if row.gain else 0
@@ -69,9 +70,8 @@ def _pairs(process: Process, model: StepResponseModel) -> list[Finding]:
             )
             out.append(Finding("look", subject, words))
         elif rise < FAST:
-            advice = (
-                f"reaches 63 % within {rise} samples of {model.dt:g} s: sample faster, or filter less is seen"
-            )
+            count = f"{rise} sample{'s' if rise > 1 else ''} of {model.dt:g} s"
+            advice = f"reaches 63 % within {count}: what it does in between is not seen; sample faster"
             out.append(Finding("look", subject, f"{words}; {advice}"))
         elif row.gain * s[i, j, begin] < 0:
             out.append(
@@ -80,11 +80,6 @@ def _pairs(process: Process, model: StepResponseModel) -> list[Finding]:
         else:
             out.append(Finding("fine", subject, words))
     return out
-
-
-def _amount(value: float | None, unit: str, digits: str = "g") -> str:
-    """A number with its unit, if it has one."""
-    return f"{value:{digits}}" + (f" {unit}" if unit not in ("", "1") else "")
 
 
 def _horizons(process: Process, model: StepResponseModel) -> list[Finding]:
@@ -111,7 +106,10 @@ def _gains(process: Process, model: StepResponseModel) -> list[Finding]:
     values = np.linalg.svd(scaled, compute_uv=False)
     strength = f"strongest direction {values[0]:.3g}, weakest {values[-1]:.3g} spans of CVs per span of MVs"
     if values[-1] <= 0 or values[0] / values[-1] > ILL:
-        words = f"{strength}: setpoints in the weak direction need large moves or cannot be reached together"
+        words = (
+            f"{strength}: setpoints in the weak direction need large moves or cannot be reached together: "
+            "weigh the CVs by what matters"
+        )
         return [Finding("look", "gains", words)]
     return [Finding("fine", "gains", strength)]
 
@@ -129,10 +127,13 @@ def _steps(process: Process, model: StepResponseModel) -> list[Finding]:
             if not costs[i]:
                 continue  # no setpoint counts
             effect, zone = abs(gains[i, j]) * float(step or 0.0), float(tuning.deadzone[i])
-            moved, allowed = _amount(effect, cv.unit, ".3g"), _amount(zone, cv.unit)
-            words = f"one step of {_amount(step, mv.unit)} moves it by {moved}, deadzone +-{allowed}"
+            moved, allowed = amount(effect, cv.unit), amount(zone, cv.unit)
+            words = f"one step of {amount(step, mv.unit)} moves it by {moved}, deadzone +-{allowed}"
             if effect > 2 * zone:
-                words += ": between two steps no position keeps it inside; rounding hunts, whole moves rest off the setpoint"
+                words += (
+                    f": between two steps no position keeps it inside; rounding hunts, whole moves rest off the setpoint, "
+                    f"unless the deadzone is +-{amount(effect / 2, cv.unit)}"
+                )
                 out.append(Finding("look", f"{mv.name} on {cv.name}", words))
             else:
                 out.append(Finding("fine", f"{mv.name} on {cv.name}", words))
@@ -157,10 +158,11 @@ def _references(process: Process, model: StepResponseModel) -> list[Finding]:
                 worst = int(np.abs(found.fun).argmax())
                 cv = process.cvs[worst]
                 miss = abs(found.fun[worst]) * process.settled[worst]
-                away.append(f"from {start:g} s: {cv.name} at least {miss:.3g} {cv.unit} off")
+                away.append(f"from {start:g} s: {cv.name} at least {amount(miss, cv.unit)} off")
         subject = f"references.{name}"
         if away:
             words = f"{len(away)} of {len(reference.times)} setpoints cannot be held by the model: {'; '.join(away[:3])}"
+            words += "; ask for others, or widen low and high of the MVs"
             out.append(Finding("look", subject, words))
         else:
             out.append(

@@ -104,17 +104,9 @@ def _made(process: Process, source: PlantSource, path: str, actuators: Sequence[
     if source.kind == "fmu":
         from identify.fmu import FmuPlant
 
-        options = dict(source.options)
-        variables = options.pop("variables", {})  # by name in the process, where the FMU calls it otherwise
-        of = lambda names: [variables.get(name, name) for name in names]  # noqa: E731
-        return FmuPlant(
-            folder / source.source,
-            dict(zip(of(process.mv_names), actuators, strict=True)),
-            of(process.cv_names),
-            of(process.disturbance_names),
-            dt=process.dt,
-            **options,
-        )
+        mvs = dict(zip(process.mv_names, actuators, strict=True))
+        named = process.cv_names, process.disturbance_names
+        return FmuPlant(folder / source.source, mvs, *named, dt=process.dt, **source.options)
     make = imported(source.source, folder, f"{path}.source")
     return make(actuators=tuple(actuators), **source.options)
 

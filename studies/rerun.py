@@ -76,8 +76,11 @@ def study_of(store: Path) -> Study:
     with open_study(store) as data:
         body, folder = provenance(data, "definition"), provenance(data, "folder")
         quick = provenance(data, "quick")
-    if not isinstance(body, dict):
-        raise InputError("store", str(store), "a store of a sweep study, with its definition")
+    if not isinstance(body, dict) or "study" not in body:
+        expected = (
+            "the store of a sweep; a comparison has every sample of its runs already, and figures of them"
+        )
+        raise InputError("store", str(store), expected)
     definition = StudyDefinition.from_dict(from_strict_json(body), folder or ".")
     made = expand(definition, quick=bool(quick), confirmed=True)
     return made.evaluated(store) if isinstance(made, SearchStudy) else made

@@ -27,6 +27,7 @@ from jaxmpc.process.responses import TransferFunctionSection, responses_of
 
 DEFAULT_PROCESS = "gas-lifted-well"  # of studies that name none
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
+VARIABLE = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")  # of a CV, an MV, a disturbance or a key figure
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Numbers = dict[str, float]
 
@@ -256,7 +257,7 @@ def _check_names(file: ProcessFile) -> None:
         for i, section in enumerate(getattr(file, table)):
             path, expected = f"{table}[{i}].name", "letters, digits and '_', a letter first"
             loads = [f"output.{cv.name}" for cv in file.cv] if table == "disturbance" else []
-            named = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,63}", section.name) or section.name in loads
+            named = VARIABLE.fullmatch(section.name) or section.name in loads
             _require(named, path, section.name, expected)
             _require(
                 section.name not in seen,

@@ -13,6 +13,8 @@ import numpy as np
 
 from jaxmpc.errors import InputError, near
 from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.process.file import VARIABLE
+from jaxmpc.process.process import amount
 
 SETTLED = 0.02  # of the largest value of a response: within it, it has settled
 LEAST_HORIZON = 20  # samples
@@ -40,34 +42,37 @@ def new_process(
         ``(text, guesses)``.
 
     Raises:
-        InputError: for MVs that the model has not, or steps that are not positive.
+        InputError: for names that no process may have, MVs that the model has not, or steps that are not positive.
     """
     steps = dict(steps or {})
-    for mv in (*steps, *switches):
-        if mv not in model.mv_names:
-            raise InputError(
-                "--step", mv, f"an MV of the model: {', '.join(model.mv_names)}", near(mv, model.mv_names)
-            )
-    for mv, step in steps.items():
-        if not 0 < step < math.inf:
-            raise InputError("--step", f"{mv}={step:g}", "a positive step [MV unit]")
+    _check(model, steps, switches)
     point = dict(model.working_point)
     cv_units, mv_units = (units or ("1",) * len(names) for units, names in _names(model))
     ranges = {
         mv: _range(unit, point.get(mv), mv in switches)
         for mv, unit in zip(model.mv_names, mv_units, strict=True)
     }
-    spans = np.array([(high - low) / 4 for low, high in ranges.values()])
+    spans = np.array([(high - low) / (1 if mv in switches else 4) for mv, (low, high) in ranges.items()])
+    moves = {
+        mv: high - low if mv in switches else steps.get(mv) or _round((high - low) / 50)
+        for mv, (low, high) in ranges.items()
+    }
     gains = np.asarray(model.coefficients)[:, :, -1]
     reach = np.abs(gains) @ spans
     cv_spans = [_round(value) if value > 0 else 1.0 for value in reach]
     horizon, control = _horizons(model)
-    guesses = [
-        f"the range of {mv}: {low:g} to {high:g} {unit}, and at most {_move(low, high, steps.get(mv)):g} per sample"
+    guesses = [] if model.cv_units and model.mv_units else ["all units: the model names none"]
+    if not point:
+        guesses.append(
+            "the working point: the model has none, so that all CVs and MVs are deviations from it"
+        )
+    guesses += [
+        f"the range of {mv}: {low:g} to {amount(high, unit)}"
+        + (", one or the other" if mv in switches else f", and at most {moves[mv]:g} per sample")
         for (mv, (low, high)), unit in zip(ranges.items(), mv_units, strict=True)
     ]
     guesses += [
-        f"the span of {cv}: {span:g} {unit}, by what the MVs do to it"
+        f"the span of {cv}: {amount(span, unit)}, by what the MVs do to it"
         for cv, span, unit in zip(model.cv_names, cv_spans, cv_units, strict=True)
     ]
     guesses.append(f"horizons of {horizon} and {control} samples, by how long the responses take")
@@ -81,15 +86,18 @@ def new_process(
         ]
     for mv, unit, span in zip(model.mv_names, mv_units, spans.tolist(), strict=True):
         low, high = ranges[mv]
-        lines += ["[[mv]]", *_variable(mv, unit, span, "guessed: a quarter of its range")]
+        lines += [
+            "[[mv]]",
+            *_variable(mv, unit, span, f"guessed: {'all' if mv in switches else 'a quarter'} of its range"),
+        ]
         lines += [f"low = {low:g} # guessed", f"high = {high:g} # guessed"]
         if mv in switches:
             lines += ['actuator = { kind = "on-off" } # stands at low or at high']
         elif mv in steps:
-            lines += [f"move = {_move(low, high, steps[mv]):g} # guessed: largest move per sample"]
+            lines += [f"move = {moves[mv]:g} # guessed: largest move per sample"]
             lines += [f'actuator = {{ kind = "stepped", step = {steps[mv]:g} }}']
         else:
-            lines += [f"move = {_move(low, high, None):g} # guessed: largest move per sample"]
+            lines += [f"move = {moves[mv]:g} # guessed: largest move per sample"]
         lines.append("")
     for dv, unit in zip(model.dv_names, model.dv_units or ("1",) * len(model.dv_names), strict=True):
         lines += [
@@ -105,17 +113,37 @@ def new_process(
             f'label = "load on {cv.replace("_", " ")}"',
         ]
         lines += [f"span = {_round(span / 5):g}", ""]
-    moves = [_move(*ranges[mv], steps.get(mv)) for mv in model.mv_names]
-    jumps = np.abs(gains) @ [
-        steps.get(mv, 0.0) for mv in model.mv_names
-    ]  # what one step of each stepped MV does
-    zones = [_round(max(span / 50, jump / 2)) for span, jump in zip(cv_spans, jumps.tolist(), strict=True)]
-    lines += _tuning(model, cv_spans, moves, zones, horizon, control)
+    stepped = [moves[mv] if mv in switches else steps.get(mv, 0.0) for mv in model.mv_names]
+    jumps = np.abs(gains) @ stepped  # what one step of each of them does
+    zones = [
+        _rounded_up(max(span / 50, jump / 2)) for span, jump in zip(cv_spans, jumps.tolist(), strict=True)
+    ]
+    lines += _tuning(model, cv_spans, list(moves.values()), zones, horizon, control)
     shifts = [
-        _shift(span, steps.get(mv), mv in switches) for mv, span in zip(model.mv_names, spans, strict=True)
+        _shift(*ranges[mv], point.get(mv, 0.0), span, steps.get(mv), mv in switches)
+        for mv, span in zip(model.mv_names, spans, strict=True)
     ]
     lines += _references(model, np.array(shifts), point, horizon)
     return "\n".join(lines), guesses
+
+
+def _check(model: StepResponseModel, steps: Mapping[str, float], switches: Sequence[str]) -> None:
+    """Refuse what no process could be made of."""
+    for kind in ("cv", "mv", "dv"):
+        for name in getattr(model, f"{kind}_names"):
+            if not VARIABLE.fullmatch(name):
+                expected = "a name of letters, digits and '_', a letter first"
+                raise InputError(f"model.{kind}", name, expected, "Rename it in the model file")
+    for option, names in (("--step", steps), ("--on-off", switches)):
+        for mv in names:
+            if mv not in model.mv_names:
+                known = f"an MV of the model: {', '.join(model.mv_names)}"
+                raise InputError(option, mv, known, near(mv, model.mv_names))
+    for mv, step in steps.items():
+        if not 0 < step < math.inf:
+            raise InputError("--step", f"{mv}={step:g}", "a positive step [MV unit]")
+        if mv in switches:
+            raise InputError("--step", f"{mv}={step:g}", "nothing: it is on or off")
 
 
 def _names(model: StepResponseModel) -> tuple[tuple[tuple[str, ...], tuple[str, ...]], ...]:
@@ -131,27 +159,33 @@ def _round(value: float, digits: int = 2) -> float:
     return float(f"{value:.{digits}g}")
 
 
+def _rounded_up(value: float) -> float:
+    """A number of two digits that is not less."""
+    digit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return _round(math.ceil(value / digit - 1e-9) * digit)
+
+
 def _range(unit: str, point: float | None, switch: bool) -> tuple[float, float]:
     """Low and high limit of an MV."""
-    if switch:
-        return 0.0, 1.0
     if unit == "%":
         return 0.0, 100.0
+    if switch:
+        return 0.0, 1.0
     if point:
         return tuple(sorted((0.0, _round(2 * point))))  # type: ignore[return-value]
     return -10.0, 10.0
 
 
-def _move(low: float, high: float, step: float | None) -> float:
-    """Largest move per sample: one step, or a fiftieth of the range."""
-    return step or _round((high - low) / 50)
+def _shift(low: float, high: float, at: float, span: float, step: float | None, switch: bool) -> float:
+    """How far an MV is shifted for a setpoint, towards its farther limit.
 
-
-def _shift(span: float, step: float | None, switch: bool) -> float:
-    """How far an MV is shifted for a setpoint: a third of its span, or between two positions, where rounding hunts."""
+    A third of its span, or between two positions, where rounding hunts; a switch goes to its other end.
+    """
+    way, room = (1, high - at) if high - at >= at - low else (-1, at - low)
     if switch:
-        return span
-    return span / 3 if step is None else (max(int(span / 3 / step), 1) + 0.5) * step
+        return way * room
+    size = span / 3 if step is None else (max(int(span / 3 / step), 1) + 0.5) * step
+    return way * (size if size <= room else min(step or size, room) / 2)
 
 
 def _horizons(model: StepResponseModel) -> tuple[int, int]:

@@ -24,6 +24,11 @@ Fields = dict[str, Any]
 BLOCKING = "moves", "inputs", "none"
 
 
+def amount(value: float, unit: str) -> str:
+    """A number in three digits with its unit, if it has one."""
+    return f"{value:.3g}" + (f" {unit}" if unit not in ("", "1") else "")
+
+
 @dataclasses.dataclass(frozen=True)
 class Variable:
     """A CV, an MV or a disturbance."""
@@ -32,11 +37,6 @@ class Variable:
     unit: str
     label: str  # in words, without the unit
     span: float = 1.0  # how far it typically moves, in its unit
-
-    @property
-    def titled(self) -> str:
-        """Label and unit, for an axis."""
-        return f"{self.label} [{self.unit}]" if self.unit not in ("", "1") else self.label
 
 
 @dataclasses.dataclass(frozen=True)

@@ -292,5 +292,6 @@ def find(fields: Mapping[str, Field], path: str, key: Any, *given: Any) -> Field
         # a last name that exists elsewhere, such as deadzone.NAME without tuning
         alike = [known for known in fields if known.endswith("." + str(key).rpartition(".")[2])][:3]
         hint = near(key, fields) or (f"Did you mean {' or '.join(alike)}?" if alike else "")
-        raise InputError(path, (*given, key)[0], "a key of docs/studies.md", hint)
+        expected = "a key that jaxmpc process keys PROCESS lists for the process of the study"
+        raise InputError(path, (*given, key)[0], expected, hint)
     return fields[key]

@@ -165,7 +165,9 @@ def _plants(
     plant = open_plant(process, name, actual=first.actuator == "step", parameters=shared)
     if not isinstance(plant, JaxPlant):
         with closing(plant):
-            return [plant.replaced({key: s.plant[key] for key in varying}) for s in scenarios]
+            if hasattr(plant, "replaced"):  # an FMU is looked into once
+                return [plant.replaced({key: s.plant[key] for key in varying}) for s in scenarios]
+        return [open_plant(process, name, actual=first.actuator == "step") for _ in scenarios]
     if not varying:
         return plant
     return lanes_of_plants(plant, {key: np.array([s.plant[key] for s in scenarios]) for key in varying})

@@ -52,6 +52,20 @@ def test_disturbances_are_changes_from_what_their_variables_start_with(path):
         assert plant.step([1.0], 0.0).cv == 2004.5
 
 
+def test_signals_have_the_names_of_the_process_whatever_the_fmu_calls_them(path):
+    variables = {"valve": "u", "load": "bias", "total": "sum"}
+    given = dict(dt=10.0, variables=variables, working_point={"valve": 2.0})
+    with FmuPlant(path, {"valve": (0.0, 10.0)}, ["total"], ["load"], **given) as plant:
+        assert (plant.mv_names, plant.cv_names, plant.disturbance_names) == (
+            ("valve",),
+            ("total",),
+            ("load",),
+        )
+        undisturbed = plant.init().cv
+        assert plant.step([12.0], [0.25]).cv - undisturbed == 10.0 - 2.0 + 0.25
+        assert plant.replaced({}).disturbance_names == ("load",)
+
+
 def test_every_type_of_fmi_3_is_set_and_the_end_that_an_fmu_asks_for_is_told(tmp_path):
     path = fmus.make_fmu3(tmp_path)
     largest = {"Int8": 2**7 - 1, "UInt8": 2**8 - 1, "Int16": 2**15 - 1, "UInt16": 2**16 - 1}
