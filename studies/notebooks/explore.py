@@ -78,7 +78,26 @@ def _(mo):
             thread.join()
             mo.output.clear()
 
-    return Clock, compilation_shown, time
+    @contextlib.contextmanager
+    def progress_shown():
+        """Gives what takes done and total samples; a bar is there as soon as a run takes longer than a second."""
+        clock, bars, past = Clock(), contextlib.ExitStack(), [0.0]
+
+        def report(done, total):
+            part = done / total
+            if not past[0] and (clock.seconds < 1 or part == 1):
+                return
+            if not past[0]:
+                bar = mo.status.progress_bar(total=1, title="running", show_eta=True, remove_on_exit=True)
+                report.bar = bars.enter_context(bar)
+                report.bar.start_time = time.time() - clock.seconds
+            report.bar.update(increment=part - past[0])
+            past[0] = part
+
+        with bars:
+            yield report
+
+    return compilation_shown, progress_shown
 
 
 @app.cell
@@ -196,7 +215,6 @@ def _(choices, mo, model_panel, page, setpoint_panel, tuning_panel, choices_pane
 
 @app.cell
 def _(
-    Clock,
     InputError,
     choices,
     compilation_shown,
@@ -205,9 +223,9 @@ def _(
     explored,
     further,
     mo,
+    progress_shown,
     scenario,
     soft,
-    time,
     tuning,
 ):
     run, refused = None, None
@@ -215,24 +233,8 @@ def _(
         _base = controls.base_of(
             explored, choices.value, soft.value, tuning.value, scenario.value, further.value
         )
-        if choices.value["run"]:
-            with (
-                compilation_shown(),
-                mo.status.progress_bar(
-                    total=1, title=choices.value["run"], show_eta=True, remove_on_exit=True
-                ) as _bar,
-            ):
-                _done, _clock = [0.0], Clock()
-
-                def _report(done, total):
-                    _bar.start_time = time.time() - _clock.seconds
-                    _bar.update(increment=done / total - _done[0])
-                    _done[0] = done / total
-
-                run = explore.run(explored, _base, _report)
-        else:
-            with compilation_shown():
-                run = explore.run(explored, _base)
+        with compilation_shown(), progress_shown() as _report:
+            run = explore.run(explored, _base, _report)
     except InputError as error:
         refused = mo.callout(str(error), kind="warn")
     return refused, run

@@ -29,11 +29,12 @@ from jaxmpc import Structure, make_tuning
 from jaxmpc.cli import main as cli
 from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.process.file import shipped_processes
 from jaxmpc.process.new import new_process
 from studies.definition.sweep import StudyDefinition
 from studies.load import expand
 from studies.notebooks import controls, export, launch
-from studies.notebooks.loop import RUN, explorer, main, nested, run, shown_figures, written
+from studies.notebooks.loop import RUN, SHORT, explorer, main, nested, run, shown_figures, written
 from studies.plans import plan_at
 from studies.rerun import close_loop
 from tests import studies_synthetic
@@ -110,6 +111,13 @@ def test_controls_that_are_not_touched_say_what_the_preset_says(process, request
         assert list(base["tuning"][field]) == list(names)
     assert base["reference"] == explored.short_step()
     assert (base["controller"], base["actuator"]) == ("mixed-integer", "step")
+
+
+@pytest.mark.parametrize("name", shipped_processes())
+def test_the_first_run_of_every_shipped_process_is_one_scenario(name):
+    one = explorer(name)
+    made = expand(StudyDefinition.from_dict(one.definition.body | {"base": controls.first_base(one)}))
+    assert (made.count, made.scenario(0).samples) == (1, SHORT)
 
 
 def test_a_slider_can_stand_where_its_preset_is(explored, well):
