@@ -1,7 +1,6 @@
 """One closed loop as the panels read it, and its figure: CVs with setpoints above, MVs below.
 
-`jaxmpc simulate` draws a scenario that was run again with `draw_run`; `figures.show` and the app (`figures.explore`) share
-the rest.
+`jaxmpc simulate` draws a scenario that was run again with `draw_run`; `figures.show` and the app read one run as `results`.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.process.process import Process
 
 RUN = "run"  # name of the one controller in results of one run
-PINNED: dict[str, Any] = {"color": "#9A9A9A", "linewidth": 1.8, "label": "pinned", "zorder": 1.5}
 
 
 @style.house_style
@@ -63,29 +61,15 @@ def run(data: xr.Dataset, title: str) -> Figure:
     return drawn
 
 
-def tracking(
-    axes: Iterable[Axes],
-    data: xr.Dataset,
-    controller: str,
-    pinned: xr.Dataset | None = None,
-    legend: bool = True,
-    bins: int = 12,
-) -> None:
-    """CVs with setpoint and deadzone, MVs, stepped ones with what was demanded, a panel each; a pinned run in grey behind.
-
-    Of `pinned`, results of one controller `RUN`, only times of `data` are drawn. A time axis has at most `bins` numbers.
-    """
+def tracking(axes: Iterable[Axes], data: xr.Dataset, controller: str, legend: bool = True) -> None:
+    """CVs with setpoint and deadzone, MVs, stepped ones with what was demanded, a panel each."""
     start, end = panels.span(data)
     cvs, stepped = panels.cv_names(data), panels.stepped(data)
     for ax, channel in zip(axes, [*cvs, *panels.mv_names(data)], strict=True):
-        seconds = panels.time_axis(ax, start, end, bins)
+        seconds = panels.time_axis(ax, start, end)
         spec = ax.get_subplotspec()
         if spec is not None and not spec.is_last_row():
             ax.set_xlabel("")
-        if pinned is not None:
-            inside = pinned.isel(time=np.flatnonzero(pinned.time.values < end))
-            draw = panels.measured if channel in cvs else panels.manipulated
-            draw(ax, inside, RUN, channel, seconds, **PINNED)
         if channel in cvs:
             panels.controlled(ax, data, controller, channel, seconds, legend=legend)
         else:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import json
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -29,6 +30,7 @@ ZOOM = "zoom"  # name of the selection of the time axis
 BEFORE = 60  # samples of the past beside a plan
 CAPTION = "Setpoint dashed, deadzone grey, demands of stepped MVs dotted. Drag over the strip at the bottom to zoom."
 LEFT = 52  # pixels for the numbers of a vertical axis: panels below each other line up
+SCHEMA = "https://vega.github.io/schema/vega-lite/v6.json"
 FONT = "system-ui, sans-serif"
 PLAN = {  # colour and dashes of what is beside a plan
     "setpoint": ("black", [5, 3]),
@@ -170,13 +172,19 @@ def as_html(spec: Spec) -> str:
     Raises:
         MissingToolError: if vl-convert is not installed, which brings the script.
     """
-    if importlib.util.find_spec("vl_convert") is None:
+    if not can_be_sent():
         raise MissingToolError("A page to send needs vl-convert: pip install 'jaxmpc[notebook]'")
-    import altair
+    import vl_convert
 
-    return altair.VConcatChart.from_dict(spec, validate=False).to_html(
-        inline=True, fullhtml=False, output_div="chart"
-    )
+    told = json.dumps(spec).replace("</", "<\\/")  # no text ends the script
+    drawing = f"vegaEmbed('#chart', {told}, {{actions: false, renderer: 'svg'}});"
+    libraries = vl_convert.javascript_bundle().replace("</script", "<\\/script")
+    return f'<div id="chart"></div><script>{libraries}</script><script>{drawing}</script>'
+
+
+def can_be_sent() -> bool:
+    """Whether what `as_html` needs is installed."""
+    return importlib.util.find_spec("vl_convert") is not None
 
 
 def altair_of(spec: Spec) -> Any:
@@ -238,7 +246,7 @@ def _time(unit: str | None, *, labels: bool = True, domain: Any = None, axis: Sp
 
 
 def _value(name: str) -> Spec:
-    axis = {"minExtent": LEFT, "tickCount": 4}
+    axis = {"minExtent": LEFT, "tickCount": 4, "format": ",.6~g"}
     return {"field": name, "type": "quantitative", "title": None, "scale": {"zero": False}, "axis": axis}
 
 
@@ -250,7 +258,7 @@ def _panel(title: str, layers: list[Spec], width: int, height: int) -> Spec:
 def _chart(rows: Iterable[Spec]) -> Spec:
     """Rows below each other, with the fonts and lines of every chart of the app."""
     return {
-        "$schema": "https://vega.github.io/schema/vega-lite/v6.json",
+        "$schema": SCHEMA,
         "vconcat": list(rows),
         "spacing": 6,
         "usermeta": {"embedOptions": {"renderer": "svg", "actions": False}},

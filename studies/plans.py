@@ -65,6 +65,10 @@ def plan_at(data: xr.Dataset, controller: str, time: float) -> StoredPlan:
     cv = run.measurement.values[0] + run.bias.values[k] + np.zeros((horizon, 1))
     for i in np.flatnonzero(made.any(axis=1)).tolist():
         cv += _response(steps, made[i], horizon, k - i)
+    if "dv" in run:  # what measured disturbances did is fed forward
+        changes = np.diff(run.dv.values[: k + 1], axis=0, prepend=0.0)
+        for i in np.flatnonzero(changes.any(axis=1)).tolist():
+            cv += _response(data.dv_coefficient.values, changes[i], horizon, k - i)
     for i in np.flatnonzero(move.any(axis=1)).tolist():
         cv[i:] += _response(steps, move[i], horizon - i, 0)
     before = run.demand.values[k] - run.move.values[k]

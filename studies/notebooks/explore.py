@@ -27,6 +27,7 @@ def _(mo):
 
     from figures import choose, closed_loop
     from figures import explore as draw
+    from jaxmpc import html
     from jaxmpc.errors import InputError
     from studies.notebooks import controls, export
     from studies.notebooks import loop as explore
@@ -36,7 +37,7 @@ def _(mo):
         return mo.ui.altair_chart(draw.altair_of(spec), chart_selection=False, legend_selection=False)
 
     SLIDER = {"show_value": True, "debounce": True, "full_width": True}
-    return InputError, SLIDER, choose, closed_loop, controls, draw, explore, export, meta, vega
+    return InputError, SLIDER, choose, closed_loop, controls, draw, explore, export, html, meta, vega
 
 
 @app.cell
@@ -91,7 +92,7 @@ def _(InputError, compilation_shown, explore, meta, mo):
 
 
 @app.cell
-def _(controls, explored, mo):
+def _(controls, explored, html, mo):
     # Shown by the cell that makes them, as all controls are: a cell that only lays them out would run, and draw every
     # one of them again, whenever one is moved.
     choices = mo.ui.dictionary(
@@ -104,7 +105,7 @@ def _(controls, explored, mo):
     _rows = "".join(f"<span>{name}</span>{element}" for name, element in choices.elements.items())
     choices_panel = mo.vstack(
         [
-            mo.md(f"**{explored.process.title or explored.process.name}**"),
+            mo.Html(f"<b>{html.escape(explored.process.title or explored.process.name)}</b>"),
             mo.Html(
                 '<div style="display:grid;grid-template-columns:auto 1fr;gap:0 1rem;align-items:center;'
                 f'font-size:0.9rem">{_rows}</div>'
@@ -137,8 +138,8 @@ def _(SLIDER, controls, explore, explored, mo):
         }
     )
     _of = lambda *heads: [e for key, e in scenario.elements.items() if key.startswith(heads)]  # noqa: E731
-    _from = f"**Setpoints** from {explore.STEP * explored.process.dt:g} s"
-    setpoint_panel = mo.vstack([mo.md(_from), *_of("setpoint.")], gap=0.4)
+    _from = f"<span><b>Setpoints</b> from {explore.STEP * explored.process.dt:g} s</span>"
+    setpoint_panel = mo.vstack([mo.Html(_from), *_of("setpoint.")], gap=0.4)
     _more = _of("disturbance.", "model.")
     model_panel = mo.accordion({"Disturbances and model": mo.vstack(_more, gap=0.4)}) if _more else mo.md("")
     return model_panel, scenario, setpoint_panel
@@ -293,11 +294,16 @@ def _(chart, draw, export, controls, get_pins, mo, page, pin, pin_name, refused,
                 '<div id="key-figures" style="font-size:12px;line-height:1.3;white-space:nowrap">'
                 f"{export.figures_table(runs, colours)}</div>"
             ),
-            mo.hstack([pin, pin_name], justify="start", widths=[1, 1], align="center"),
+            mo.Html(
+                '<div style="display:flex;gap:0.5rem;align-items:center;white-space:nowrap">'
+                f'{pin}<span style="width:7rem">{pin_name}</span></div>'
+            ),
             mo.hstack(list(unpin.elements), justify="start", wrap=True),
             mo.md(f"<small>run and key figures: {run.seconds:.2f} s</small>"),
         ]
         drawn = mo.vstack([chart, mo.md(f"<small>{draw.CAPTION}</small>")], gap=0.1)
+        if len(runs) > 2:  # a wide table
+            return mo.vstack([drawn, *side], gap=0.3)
         return mo.hstack([drawn, mo.vstack(side, gap=0.3)], widths=[2.15, 1], align="start", gap=0.75)
 
     _view() if page.value == "Run a loop" else None
@@ -344,6 +350,7 @@ def _(controls, export, get_pins, mo, page, run):
                 "runs.html",
                 "text/html",
                 label="Page of these runs",
+                disabled=not draw.can_be_sent(),
             ),
         ]
         shown = mo.accordion(
@@ -365,43 +372,114 @@ def _(meta, mo):
 
 @app.cell
 def _(InputError, choose, mo, path):
-    table, scatter, trouble = None, None, mo.md("Path of a sweep (`….zarr`) or of a comparison (its folder).")
+    runs, trouble = None, mo.md("Path of a sweep (`….zarr`) or of a comparison (its folder).")
+    get_ranges, set_ranges = mo.state(())
     if path.value.strip():
         try:
-            table = choose.points(path.value.strip())
-            scatter = mo.ui.altair_chart(
-                choose.scatter(table), chart_selection="point", legend_selection=False
-            )
+            runs = choose.points(path.value.strip())
         except InputError as error:
             trouble = mo.callout(str(error), kind="warn")
-    return scatter, table, trouble
+    return get_ranges, runs, set_ranges, trouble
 
 
 @app.cell
-def _(mo, page, path, scatter, trouble):
-    mo.vstack([path, scatter if scatter is not None else trouble]) if page.value == "Open a study" else None
+def _(choose, get_ranges, runs, vega):
+    across = None
+    if runs is not None and runs.axes:
+        across = vega(choose.parallel(runs, choose.within(runs, get_ranges())))
+    return (across,)
+
+
+@app.cell
+def _(across, choose, get_ranges, mo, runs, set_ranges):
+    dragged = () if across is None else tuple(choose.conditions(across.selections.get(choose.BRUSH)))
+    _all = (*get_ranges(), *dragged)
+    chosen = None if runs is None else choose.within(runs, _all)
+    keep = mo.ui.button(
+        label="Keep the range",
+        on_click=lambda _: set_ranges(lambda old: (*old, *dragged)),
+        disabled=not dragged,
+    )
+    clear = mo.ui.button(label="Clear", on_click=lambda _: set_ranges(()), disabled=not get_ranges())
+    _words = (
+        "; ".join(choose.in_words(runs, one) for one in _all)
+        or "Lines of runs on the front are red. Drag over an axis to choose a range of it."
+    )
+    ranges_panel = mo.hstack([mo.md(f"<small>{_words}</small>"), mo.hstack([keep, clear], justify="end")])
+    return chosen, ranges_panel
+
+
+@app.cell
+def _(choose, chosen, mo, runs):
+    scatter = None
+    if runs is not None:
+        scatter = mo.ui.altair_chart(
+            choose.scatter(runs, chosen), chart_selection="point", legend_selection=False
+        )
+    return (scatter,)
+
+
+@app.cell
+def _(across, mo, page, path, ranges_panel, scatter, trouble):
+    _shown = [path, trouble] if scatter is None else [path, scatter]
+    _shown += [] if across is None else [across, ranges_panel]
+    mo.vstack(_shown, gap=0.4) if page.value == "Open a study" else None
     return
 
 
 @app.cell
-def _(choose, mo, path, scatter):
-    picked = None
+def _(choose, mo, page, runs, vega):
+    _shown = page.value == "Open a study" and runs is not None and len(runs.axes) > 0
+    vega(choose.importance_chart(runs)) if _shown else None
+    return
+
+
+@app.cell
+def _(choose, chosen, mo, runs):
+    rows = None
+    if runs is not None:
+        _columns = ["number", choose.X, choose.Y, "best", *(runs.axes or ["run"])]
+        _few = runs.table[chosen].sort_values(choose.X)[_columns].rename(columns=runs.titles).round(4)
+        rows = mo.ui.table(
+            _few.to_dict("records"),
+            selection="multi",
+            page_size=8,
+            show_column_summaries=False,
+            show_data_types=False,
+            label="Tick runs to see them beside each other",
+        )
+    return (rows,)
+
+
+@app.cell
+def _(mo, page, rows):
+    mo.vstack([rows]) if page.value == "Open a study" and rows is not None else None
+    return
+
+
+@app.cell
+def _(choose, mo, path, rows, runs, scatter):
+    picked = []  # numbers of runs
     if scatter is not None and 0 < len(scatter.value) < len(scatter.dataframe):  # all of them: none is picked
-        picked = scatter.value.iloc[0]
+        picked.append(int(scatter.value.iloc[0]["number"]))
+    if rows is not None:
+        picked += [number for number in (row["number"] for row in rows.value) if number not in picked]
     again = mo.ui.run_button(
         label="Run it in full",
         tooltip="closes this loop again and shows every sample",
-        disabled=picked is None or choose.is_comparison(path.value.strip()),
+        disabled=len(picked) != 1 or choose.is_comparison(path.value.strip()),
     )
     return again, picked
 
 
 @app.cell
-def _(InputError, again, choose, closed_loop, compilation_shown, draw, mo, page, path, picked, vega):
+def _(
+    InputError, again, choose, closed_loop, compilation_shown, draw, html, mo, page, path, picked, runs, vega
+):
     def _view():
-        if picked is None:
-            return mo.md("Pick a point to see its run.")
-        store, number = path.value.strip(), int(picked["number"])
+        if not picked:
+            return mo.md("Pick a point, or tick runs in the table, to see them.")
+        store, shown = path.value.strip(), picked[: len(draw.COLOURS)]
         try:
             if again.value:
                 from pathlib import Path
@@ -409,16 +487,28 @@ def _(InputError, again, choose, closed_loop, compilation_shown, draw, mo, page,
                 from studies.rerun import rerun
 
                 with compilation_shown(), mo.status.spinner("running"):
-                    found = rerun(Path(store), number)
-                data = closed_loop.of_trajectory(
-                    found.trajectory, found.deadzone, found.kind, found.actuator, found.process
-                )
+                    found = rerun(Path(store), picked[0])
+                data = [
+                    closed_loop.of_trajectory(
+                        found.trajectory, found.deadzone, found.kind, found.actuator, found.process
+                    )
+                ]
             else:
-                data = choose.stored(store, number)
+                data = [choose.stored(store, number) for number in shown]
         except InputError as error:
             return mo.callout(str(error), kind="warn")
-        drawn = vega(draw.tracking([draw.Shown("the picked run", draw.COLOURS[0], data)], width=800))
-        title = mo.md(f"**{number}**: {picked['run']}")
+        names = runs.table.set_index("number")["run"]
+        lines = [
+            draw.Shown(str(number), colour, one)
+            for number, colour, one in zip(shown, draw.COLOURS, data, strict=False)
+        ]
+        heads = [(line.colour, line.name, names[int(line.name)]) for line in lines]
+        title = mo.Html(
+            "<br>".join(
+                f'<b style="color:{colour}">{name}</b> {html.escape(run)}' for colour, name, run in heads
+            )
+        )
+        drawn = vega(draw.tracking(lines, width=800))
         return mo.vstack([mo.hstack([title, again], widths=[5, 1]), drawn], gap=0.3)
 
     _view() if page.value == "Open a study" else None

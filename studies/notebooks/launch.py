@@ -105,8 +105,8 @@ class First:
             from jaxmpc.programs.compilation import told
             from studies.notebooks import controls, loop
 
-            self.loaded.set()
             with told(self.said.append):
+                self.loaded.set()  # from here on a page may listen, and is the last to
                 explored = loop.explorer(process or loop.DEFAULT_PROCESS)
                 loop.run(explored, controls.first_base(explored))
             self._found.set_result(explored)

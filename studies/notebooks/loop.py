@@ -148,7 +148,11 @@ class ExploreRun:
             "blocking": ("controller", [structure.blocking]),
         }
         if scenario.disturbance is not None:
-            known["disturbance"] = (("time", "disturbance_name"), scenario.disturbance[: t.samples])
+            given, names = scenario.disturbance[: t.samples], self.definition.process.disturbance_names
+            known["disturbance"] = (("time", "disturbance_name"), given)
+            if self.model.dv_names:
+                known["dv"] = (("time", "dv_name"), given[:, [names.index(dv) for dv in self.model.dv_names]])
+                known["dv_coefficient"] = (("cv", "dv_name", "lag"), np.asarray(self.model.dv_coefficients))
         for name in ("deadzone", "soft_quadratic", "soft_linear"):
             known[f"tuning_{name}"] = (("controller", "cv"), np.asarray(getattr(scenario.tuning, name))[None])
         own = {"name": RUN, "kind": scenario.kind, "actuator": scenario.actuator, "schedule": False}
@@ -235,7 +239,7 @@ def shown_figures(process: Process) -> list[tuple[str, str, str]]:
 
 def written(value: float, unit: str) -> tuple[str, str]:
     """A key figure and its unit as they are printed: times below a second in ms, others as they are."""
-    if unit == "s" and abs(value) < 1:
+    if unit == "s" and 0 < abs(value) < 1:
         value, unit = 1e3 * value, "ms"
     number = f"{value:,.4g}" if not abs(value) >= 1e4 else f"{value:,.0f}"
     return number, "" if unit == "1" else unit.replace("m3", "m³")
