@@ -280,6 +280,8 @@ WORDS = re.compile(r"(?<![a-z])(chokes?|oil|gas|lift)(?![a-z])")
     "path", [p for p in sources() if not name_of(p).startswith(OF_THE_WELL)], ids=name_of
 )
 def test_general_code_names_nothing_of_the_well(path):
-    text = path.read_text().lower().replace("gas-lifted-well", "")  # the process of studies that name none
+    text = path.read_text().lower()
+    for process in ("gas-lifted-well", "step-choke-well"):  # names of shipped processes
+        text = text.replace(process, "")
     found = [f"{i}: {line.strip()}" for i, line in enumerate(text.splitlines(), 1) if WORDS.search(line)]
     assert not found, f"{name_of(path)}:{found[0]}"
