@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -87,9 +88,9 @@ def draw(data: xr.Dataset, axes: tuple[SweepAxis, SweepAxis], label: str = "") -
         sheet.colour_bar(heat(ax, table, borders, (x, y)), ax, pad=0.02, aspect=25)
         ax.set_title(title, loc="left")
         if i // 2 == rows - 1:
-            ax.set_xlabel(across.title)
+            ax.set_xlabel(textwrap.fill(across.title, 48))
         if i % 2 == 0:
-            ax.set_ylabel(up.title)
+            ax.set_ylabel(textwrap.fill(up.title, 32))
         if len(mark):
             outline(ax, *borders, [axis.unique.index(axis.values[mark[0]]) for axis in axes])
     for spare in grid.flat[len(shown) :]:

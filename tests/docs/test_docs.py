@@ -95,8 +95,9 @@ def changed(text: str, changes: str) -> str:
     """A file in which tables, parted by empty lines, are replaced by those that begin alike."""
     parts = text.strip().split("\n\n")
     for new in changes.strip().split("\n\n"):
-        head = re.match(r"\[\[\w+\]\]\nname = .*|\[.*?\]", new)[0]
-        (at,) = (k for k, part in enumerate(parts) if part.startswith(head))
+        head = re.match(r"\[\[\w+\]\]\nname = .*|\[.*?\]", new)
+        assert head, new
+        (at,) = (k for k, part in enumerate(parts) if part.startswith(head[0]))
         parts[at] = new
     return "\n\n".join([*parts, ""])
 
