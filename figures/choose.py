@@ -303,7 +303,11 @@ def importance(runs: Runs) -> pd.DataFrame:
             values = np.searchsorted(edges, values.astype(float), side="right")
         for figure in (X, Y):
             rows.append(
-                {"axis": name, "figure": runs.titles[figure], "share": _explained(runs.table[figure], values)}
+                {
+                    "axis": name,
+                    "figure": runs.titles[figure],
+                    "share": _explained(pd.Series(runs.table[figure]), values),
+                }
             )
     return pd.DataFrame(rows, columns=["axis", "figure", "share"])
 

@@ -178,7 +178,8 @@ def as_html(spec: Spec) -> str:
 
     told = json.dumps(spec).replace("</", "<\\/")  # no text ends the script
     drawing = f"vegaEmbed('#chart', {told}, {{actions: false, renderer: 'svg'}});"
-    libraries = vl_convert.javascript_bundle().replace("</script", "<\\/script")
+    bundled: Any = vl_convert.javascript_bundle  # its default is missing in its type
+    libraries = bundled().replace("</script", "<\\/script")
     return f'<div id="chart"></div><script>{libraries}</script><script>{drawing}</script>'
 
 

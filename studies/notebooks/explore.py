@@ -313,7 +313,7 @@ def _(chart, draw, export, controls, get_pins, mo, page, pin, pin_name, refused,
 
 
 @app.cell
-def _(controls, export, get_pins, mo, page, run):
+def _(controls, draw, export, get_pins, mo, page, run):
     def _view():
         runs, colours = controls.named(run, get_pins())
         return mo.Html(
@@ -340,7 +340,7 @@ def _(draw, mo, page, plan_time, run, vega):
 
 
 @app.cell
-def _(controls, export, get_pins, mo, page, run):
+def _(controls, draw, export, get_pins, mo, page, run):
     def _view():
         runs, colours = controls.named(run, get_pins())
         toml, python = export.as_toml(run), export.as_python(run)
