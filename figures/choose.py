@@ -306,7 +306,7 @@ def importance(runs: Runs) -> pd.DataFrame:
                 {
                     "axis": name,
                     "figure": runs.titles[figure],
-                    "share": _explained(pd.Series(runs.table[figure]), values),
+                    "share": _explained(runs.table[figure].to_numpy(dtype=float), values),
                 }
             )
     return pd.DataFrame(rows, columns=["axis", "figure", "share"])
@@ -354,9 +354,8 @@ def importance_chart(runs: Runs, width: int = 300) -> Spec:
     }
 
 
-def _explained(figure: pd.Series, groups: np.ndarray) -> float:
+def _explained(y: np.ndarray, groups: np.ndarray) -> float:
     """Epsilon squared; not a number where there is nothing to explain."""
-    y = figure.to_numpy(dtype=float)
     there = np.isfinite(y)
     y, groups = y[there], np.asarray(groups)[there]
     total, names = np.sum((y - y.mean()) ** 2) if len(y) else 0.0, set(groups.tolist())
