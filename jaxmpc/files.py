@@ -13,13 +13,14 @@ import os
 import secrets
 import stat
 import tempfile
+import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxmpc.errors import InputError
+from jaxmpc.errors import InputError, near
 
 Content = str | bytes | Callable[[str], object]
 NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}  # numbers that JSON has no word for
@@ -55,6 +56,33 @@ def json_by_field(body: dict[str, Any], **options: Any) -> str:
     """The text of a JSON object with a line per field; options of `json.dumps`."""
     fields = (f" {json.dumps(key)}: {json.dumps(value, **options)}" for key, value in body.items())
     return "{\n" + ",\n".join(fields) + "\n}\n"
+
+
+def read_named_toml(
+    field: str, name_or_path: str | Path, shipped: Mapping[str, Path], what: str, folder: str | Path = "."
+) -> tuple[Path, dict[str, Any]]:
+    """A TOML file that comes with the package by its name, or any by its path.
+
+    Args:
+        field: that names it, for errors.
+        shipped: files by name.
+        what: it is, for errors.
+        folder: that a path is relative to.
+
+    Returns:
+        ``(path, content)``.
+
+    Raises:
+        InputError: for an unknown name, a file that cannot be read, and text that is not TOML.
+    """
+    path = shipped.get(str(name_or_path)) or Path(folder) / name_or_path
+    try:
+        return path, tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        expected = f"{what}, or one of {', '.join(shipped)} ({error.strerror or error})"
+        raise InputError(field, str(name_or_path), expected, near(name_or_path, shipped)) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(field, str(path), f"a TOML file ({error})") from None
 
 
 def read_json(field: str, path: str | Path) -> Any:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import tomllib
 from collections.abc import Mapping
 from importlib import resources, util
 from pathlib import Path
@@ -20,6 +19,7 @@ import numpy as np
 from jaxmpc.check import as_floats, is_number
 from jaxmpc.decoding import decode
 from jaxmpc.errors import InputError, near
+from jaxmpc.files import read_named_toml
 from jaxmpc.process.actuator import Actuator
 from jaxmpc.process.process import Cv, KeyFigure, ModelSource, Mv, PlantSource, Process, Variable
 from jaxmpc.process.reference import Reference
@@ -144,15 +144,7 @@ def load_process(name_or_path: str | Path, folder: str | Path = ".") -> Process:
     Raises:
         InputError: for an unknown name, a file that cannot be read, and what `process_of` refuses.
     """
-    shipped = shipped_processes()
-    path = shipped.get(str(name_or_path)) or Path(folder) / name_or_path
-    try:
-        body = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        expected = f"a process file, or one of {', '.join(shipped)} ({error.strerror or error})"
-        raise InputError("process", str(name_or_path), expected, near(name_or_path, shipped)) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError("process", str(path), f"a TOML file ({error})") from None
+    path, body = read_named_toml("process", name_or_path, shipped_processes(), "a process file", folder)
     return process_of(body, path.parent)
 
 

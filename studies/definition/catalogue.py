@@ -16,7 +16,8 @@ from typing import Any
 import msgspec
 
 from jaxmpc.decoding import decode
-from jaxmpc.errors import InputError, near
+from jaxmpc.errors import InputError
+from jaxmpc.files import read_named_toml
 from jaxmpc.process.file import load_process, windows_reference
 from jaxmpc.process.process import Process
 from studies.definition.comparison import ComparisonDefinition, ReferenceDefinition
@@ -64,15 +65,7 @@ def load_comparison(
     Raises:
         InputError: naming the path of the field.
     """
-    shipped = shipped_comparisons()
-    path = shipped.get(str(name_or_path)) or Path(name_or_path)
-    try:
-        told = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        expected = f"a comparison ({', '.join(shipped)}) or a file ({error.strerror or error})"
-        raise InputError("study", str(name_or_path), expected, near(name_or_path, shipped)) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError("study", str(path), f"a TOML file ({error})") from None
+    path, told = read_named_toml("study", name_or_path, shipped_comparisons(), "the file of a comparison")
     return _comparison(path, told, quick, plant, process)
 
 

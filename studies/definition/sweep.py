@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import tomllib
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -22,6 +21,7 @@ from identify.plants import parameters_of
 from jaxmpc.controller.measurement import FAULTS
 from jaxmpc.decoding import decode
 from jaxmpc.errors import InputError, near
+from jaxmpc.files import read_named_toml
 from jaxmpc.process.file import load_process, shipped_processes
 from jaxmpc.process.process import Process
 from studies.definition.fields import Field, find, study_fields
@@ -171,15 +171,7 @@ def load_definition(name_or_path: str | Path, process: str | Path | None = None)
     Raises:
         InputError: for an unknown name, a file that cannot be read, text that is not TOML, and what `from_dict` refuses.
     """
-    shipped = shipped_studies()
-    path = shipped.get(str(name_or_path)) or Path(name_or_path)
-    try:
-        body = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        expected = f"a definition file, or one of {', '.join(shipped)} ({error.strerror or error})"
-        raise InputError("study", str(name_or_path), expected, near(name_or_path, shipped)) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError("study", str(path), f"a TOML file ({error})") from None
+    path, body = read_named_toml("study", name_or_path, shipped_studies(), "a definition file")
     if process is not None and isinstance(body.get("study"), dict):
         own = str(process) if str(process) in shipped_processes() else str(Path(process).resolve())
         body["study"] = body["study"] | {"process": own}
