@@ -246,6 +246,26 @@ def study(expanded: Any) -> str:
     return card(f"Study: {expanded.title}", facts(known), varying)
 
 
+def process(given: Any) -> str:
+    """Variables of a process with units, spans and limits, and what studies of it may name."""
+    rows = []
+    for kind, variables in (("CV", given.cvs), ("MV", given.mvs), ("disturbance", given.disturbances)):
+        for v in variables:
+            actuator = getattr(v, "actuator", None)
+            how = "" if actuator is None else actuator.kind
+            how += f", {number(actuator.step)} {v.unit}" if actuator is not None and actuator.step else ""
+            limits = [number(getattr(v, name)) if hasattr(v, name) else "" for name in ("low", "high")]
+            rows.append([kind, v.name, v.unit, number(v.span), *limits, how])
+    named = {
+        "plants": ", ".join(given.plants),
+        "presets": ", ".join(given.presets),
+        "references": ", ".join(given.references),
+        "sampled every": f"{number(given.dt)} s",
+    }
+    head = ("", "name", "unit", "span", "low", "high", "actuator")
+    return card(given.title, facts(named), table(head, rows))
+
+
 def _span(values: Any) -> str:
     finite = np.asarray(values, dtype=float)
     finite = finite[np.isfinite(finite)]

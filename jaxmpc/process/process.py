@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from jaxmpc import html
 from jaxmpc.errors import InputError, near
 from jaxmpc.model.transfer_function import TransferFunction
 from jaxmpc.problem.structure import Structure
@@ -148,6 +149,10 @@ class Process:
     key_figures: tuple[KeyFigure, ...]
     folder: str = "."
     body: Fields = dataclasses.field(default_factory=dict)
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        return html.process(self)
 
     @property
     def cv_names(self) -> tuple[str, ...]:

@@ -16,6 +16,7 @@ from jaxmpc.errors import InputError
 from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.model.step_response import make_model
 from jaxmpc.problem.tuning import make_tuning, stack_tunings
+from jaxmpc.process.file import load_process
 
 HOSTILE = '<script>alert("1")</script>&'
 VOID = {"line", "path", "br", "img"}
@@ -245,3 +246,13 @@ def test_what_cannot_be_drawn_is_refused_by_its_type():
         figures.plot(3)
     with pytest.raises(InputError):
         figures.plot("no-such-store.zarr")
+
+
+def test_a_process_shows_its_variables_with_units_and_what_studies_may_name():
+    process = load_process("wood-berry")
+    text = read(process).text
+    for v in (*process.cvs, *process.mvs, *process.disturbances):
+        assert v.name in text
+        assert v.unit in text
+    assert all(name in text for name in (*process.presets, *process.references))
+    assert "stepped, 0.02 lb/min" in text
