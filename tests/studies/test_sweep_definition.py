@@ -183,7 +183,11 @@ BAD_SECTIONS = {
     "a name with a slash": ({"name": "../out"}, "study.name", "folder"),
     "an unknown trajectory": ({"store": {"trajectories": ["cvs"]}}, "store.trajectories[0]", "setpoint"),
     "a stride of zero": ({"store": {"every": 0}}, "store.every", "[samples]"),
-    "a quick setting that does not exist": ({"quick": {"base": {"length": 1}}}, "quick.base.length", "docs"),
+    "a quick setting that does not exist": (
+        {"quick": {"base": {"length": 1}}},
+        "quick.base.length",
+        "jaxmpc process keys",
+    ),
     "a quick cut of no axis": (
         {"quick": {"axes": {"tuning.move_weight.chok": {"keep": [0]}}}},
         'quick.axes."tuning.move_weight.chok"',
