@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable
+import contextlib
+from collections.abc import Callable, Container, Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -41,3 +42,18 @@ def check_keys(path: str, body: Container, keys: Iterable[str]) -> None:
 def sound(values: np.ndarray) -> np.ndarray:
     """Which numbers are finite and not beyond `LARGEST`."""
     return np.abs(values) <= LARGEST
+
+
+def require(met: object, path: str, value: object, expected: str, hint: str = "") -> None:
+    """Go on if a condition is met, else raise an `InputError` of these fields."""
+    if not met:
+        raise InputError(path, value, expected, hint)
+
+
+@contextlib.contextmanager
+def located(place: Callable[[str], str]) -> Iterator[None]:
+    """Give errors of the typed objects that are built here the path in the definition, made from their own."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(place(error.field), error.value, error.expected, error.hint) from None

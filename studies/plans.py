@@ -11,7 +11,7 @@ import dataclasses
 import numpy as np
 import xarray as xr
 
-from studies.definition.refusing import require
+from jaxmpc.check import require
 from studies.store.reading import provenance
 
 

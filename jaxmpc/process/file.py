@@ -16,9 +16,9 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
-from jaxmpc.check import as_floats, is_number
+from jaxmpc.check import as_floats, is_number, located, require
 from jaxmpc.decoding import decode
-from jaxmpc.errors import InputError, near
+from jaxmpc.errors import near
 from jaxmpc.files import read_named_toml
 from jaxmpc.process.actuator import Actuator
 from jaxmpc.process.process import Cv, KeyFigure, ModelSource, Mv, PlantSource, Process, Variable
@@ -159,13 +159,13 @@ def process_of(body: Any, folder: str | Path = ".", *, files: bool = True) -> Pr
         InputError: with the path of the field.
     """
     file = decode(body, ProcessFile, name="process file", expected=_expected)
-    _require(
+    require(
         NAME.fullmatch(file.name), "name", file.name, "a letter, then up to 63 letters, digits, '-' and '_'"
     )
     _check_names(file)
-    _require(file.presets, "presets", {}, "one tuning or more, each headed [presets.NAME]")
-    _require(file.references, "references", {}, "one reference or more, each headed [references.NAME]")
-    _require(file.plants, "plants", {}, "one plant or more, each headed [plants.NAME]")
+    require(file.presets, "presets", {}, "one tuning or more, each headed [presets.NAME]")
+    require(file.references, "references", {}, "one reference or more, each headed [references.NAME]")
+    require(file.plants, "plants", {}, "one plant or more, each headed [plants.NAME]")
     cvs = tuple(_cv(f"cv[{i}]", section) for i, section in enumerate(file.cv))
     mvs = tuple(_mv(f"mv[{i}]", section) for i, section in enumerate(file.mv))
     process = Process(
@@ -214,11 +214,6 @@ def process_digest(process: Process) -> str:
 # -------------------------------------------------------------------------------------------------------- sections
 
 
-def _require(met: object, path: str, value: object, expected: str, hint: str = "") -> None:
-    if not met:
-        raise InputError(path, value, expected, hint)
-
-
 def _expected(path: str, words: str) -> str:
     """What a field takes, with its unit."""
     unit = {
@@ -250,8 +245,8 @@ def _check_names(file: ProcessFile) -> None:
             path, expected = f"{table}[{i}].name", "letters, digits and '_', a letter first"
             loads = [f"output.{cv.name}" for cv in file.cv] if table == "disturbance" else []
             named = VARIABLE.fullmatch(section.name) or section.name in loads
-            _require(named, path, section.name, expected)
-            _require(
+            require(named, path, section.name, expected)
+            require(
                 section.name not in seen,
                 path,
                 section.name,
@@ -261,12 +256,12 @@ def _check_names(file: ProcessFile) -> None:
     channels = [s.name for s in (*file.cv, *file.mv)]
     for i, section in enumerate(file.key_figure):
         expected = f"a CV or an MV: {', '.join(channels)}"
-        _require(
+        require(
             section.integral_of in channels, f"key_figure[{i}].integral_of", section.integral_of, expected
         )
     mvs, disturbances = [s.name for s in file.mv], [s.name for s in file.disturbance]
     for name, values in file.model.schedule.items():
-        _require(
+        require(
             name in mvs, f"model.schedule.{name}", values, f"one of the MVs {', '.join(mvs)}", near(name, mvs)
         )
     known_points = channels if file.model.transfer_functions else mvs
@@ -274,9 +269,9 @@ def _check_names(file: ProcessFile) -> None:
         known = {"working_point": known_points, "disturbance_steps": disturbances}.get(table, mvs)
         for name, value in getattr(file.model, table).items():
             path = f"model.{table}.{name}"
-            _require(name in known, path, value, f"one of {', '.join(known)}", near(name, known))
+            require(name in known, path, value, f"one of {', '.join(known)}", near(name, known))
             good = is_number(value) and (table == "working_point" or value != 0)
-            _require(
+            require(
                 good,
                 path,
                 value,
@@ -285,7 +280,7 @@ def _check_names(file: ProcessFile) -> None:
     for table in ("presets", "references", "plants", "disturbances"):
         for name in getattr(file, table):
             expected = "a letter, then up to 63 letters, digits, '-' and '_'"
-            _require(NAME.fullmatch(name), f"{table}.{name}", name, expected)
+            require(NAME.fullmatch(name), f"{table}.{name}", name, expected)
 
 
 def _model(file: ProcessFile) -> ModelSource:
@@ -293,7 +288,7 @@ def _model(file: ProcessFile) -> ModelSource:
     fields = msgspec.structs.asdict(file.model)
     table = fields.pop("transfer_functions")
     both = bool(table and file.model.file)
-    _require(not both, "model.file", file.model.file, "nothing: model.transfer_functions are the model")
+    require(not both, "model.file", file.model.file, "nothing: model.transfer_functions are the model")
     names = {key: [section.name for section in getattr(file, key)] for key in ("cv", "mv")}
     loads = [f"output.{name}" for name in names["cv"]]
     names["dv"] = [section.name for section in file.disturbance if section.name not in loads]
@@ -307,13 +302,13 @@ def _label(section: Any) -> str:
 def _check_limits(path: str, section: Any) -> None:
     unit = f"[{section.unit}]"
     for field in ("low", "high"):
-        _require(
+        require(
             not np.isnan(getattr(section, field)),
             f"{path}.{field}",
             getattr(section, field),
             f"a number {unit}",
         )
-    _require(
+    require(
         section.low < section.high, f"{path}.low", section.low, f"less than high = {section.high:g} {unit}"
     )
 
@@ -321,7 +316,7 @@ def _check_limits(path: str, section: Any) -> None:
 def _cv(path: str, section: CvSection) -> Cv:
     _check_limits(path, section)
     settled = section.settled or section.span / 50
-    _require(
+    require(
         settled > 0 and is_number(settled),
         f"{path}.settled",
         settled,
@@ -334,7 +329,7 @@ def _mv(path: str, section: MvSection) -> Mv:
     _check_limits(path, section)
     smallest = section.span / 1000 if section.smallest_move is None else section.smallest_move
     expected = f"0 or more [{section.unit}]"
-    _require(is_number(smallest) and smallest >= 0, f"{path}.smallest_move", smallest, expected)
+    require(is_number(smallest) and smallest >= 0, f"{path}.smallest_move", smallest, expected)
     return Mv(
         section.name,
         section.unit,
@@ -352,18 +347,15 @@ def _actuator(path: str, section: MvSection) -> Actuator:
     given = section.actuator
     fields = {name: getattr(given, name) for name in ("step", "threshold", "values")}
     fields = {name: value for name, value in fields.items() if value not in (None, ())}
-    try:
+    with located(lambda field: f"{path}.{field.removeprefix('actuator').lstrip('.')}".rstrip(".")):
         return Actuator(given.kind, low=section.low, high=section.high, origin=given.origin, **fields)
-    except InputError as error:
-        field = error.field.removeprefix("actuator").lstrip(".")
-        raise InputError(f"{path}.{field}".rstrip("."), error.value, error.expected, error.hint) from None
 
 
 def _structure_fields(given: Mapping[str, Any]) -> dict[str, Any]:
     """Lists as tuples; the values are checked where structures are built."""
     names = {"cv_names", "mv_names", "dt", "cv_units", "mv_units", "integer_step", "integer_values"}
     for key, value in given.items():
-        _require(key not in names, f"structure.{key}", value, "nothing: it follows from [[cv]] and [[mv]]")
+        require(key not in names, f"structure.{key}", value, "nothing: it follows from [[cv]] and [[mv]]")
     frozen = lambda v: tuple(map(frozen, v)) if isinstance(v, list) else v  # noqa: E731
     return {key: frozen(value) for key, value in given.items()}
 
@@ -377,16 +369,16 @@ def _preset(
     if base is None:
         return own
     path, known = f"presets.{name}.base", [other for other in presets if other not in (*seen, name)]
-    _require(base in known, path, base, f"another preset that is not made of this one: {', '.join(known)}")
+    require(base in known, path, base, f"another preset that is not made of this one: {', '.join(known)}")
     return {**_preset(presets, base, (*seen, name)), **own}
 
 
 def _rows(path: str, given: Any, columns: int, what: str) -> np.ndarray:
     expected = f"rows of {columns + 1} numbers: start [s], then {what}"
-    _require(isinstance(given, (list, tuple)) and given, path, given, expected)
+    require(isinstance(given, (list, tuple)) and given, path, given, expected)
     for i, row in enumerate(given):
         good = isinstance(row, (list, tuple)) and len(row) == columns + 1
-        _require(good, f"{path}[{i}]", row, expected)
+        require(good, f"{path}[{i}]", row, expected)
     return as_floats(path, given, expected)
 
 
@@ -402,26 +394,23 @@ def windows_reference(path: str, windows: Any, duration: Any, cvs: tuple[Cv, ...
     at = f"{path}." if path else ""
     listed = ", ".join(f"{cv.name} [{cv.unit}]" for cv in cvs)
     rows = _rows(f"{at}windows", windows, len(cvs), f"setpoints of {listed}")
-    _require(duration is not None, f"{at}duration", None, "the length of the run [s]")
-    try:
+    require(duration is not None, f"{at}duration", None, "the length of the run [s]")
+    with located(lambda field: field.replace("reference.", at, 1)):
         return Reference(rows[:, 0], rows[:, 1:], duration)
-    except InputError as error:
-        field = error.field.replace("reference.", at, 1)
-        raise InputError(field, error.value, error.expected, error.hint) from None
 
 
 def _course(name: str, section: WindowsSection, disturbances: int) -> np.ndarray:
     path = f"disturbances.{name}"
-    _require(disturbances, path, "windows", "nothing: there is no [[disturbance]]")
+    require(disturbances, path, "windows", "nothing: there is no [[disturbance]]")
     rows = _rows(f"{path}.windows", section.windows, disturbances, "one value per disturbance")
-    _require(
+    require(
         section.duration is None,
         f"{path}.duration",
         section.duration,
         "nothing: the reference has the duration",
     )
     increasing = len(rows) and rows[0, 0] >= 0 and (np.diff(rows[:, 0]) > 0).all() and np.isfinite(rows).all()
-    _require(
+    require(
         increasing, f"{path}.windows", rows[:, 0].tolist(), "finite rows at increasing times of 0 s or more"
     )
     return rows
@@ -431,19 +420,19 @@ def _check_plants(process: Process) -> None:
     for name, plant in process.plants.items():
         path, kind = f"plants.{name}.source", plant.kind
         if kind in ("jax", "python"):
-            _require(
+            require(
                 ":" in plant.source, path, plant.source, "'module:name' of a function that makes the plant"
             )
         elif kind == "fmu" or plant.source:
             found = (Path(process.folder) / plant.source).is_file() and plant.source
-            _require(found, path, plant.source, f"a file, relative to {process.folder}")
+            require(found, path, plant.source, f"a file, relative to {process.folder}")
         else:
             expected = f"a model file, or transfer_functions: plants.{name} is that model"
-            _require(process.model.given, "model.file", "", expected)
+            require(process.model.given, "model.file", "", expected)
     file = process.model.file
     if file:
         found = (Path(process.folder) / file).is_file()
-        _require(found, "model.file", file, f"a model file, relative to {process.folder}")
+        require(found, "model.file", file, f"a model file, relative to {process.folder}")
 
 
 def _check_controllers(process: Process) -> None:
@@ -451,8 +440,5 @@ def _check_controllers(process: Process) -> None:
     for integer in (False, True) if process.stepped else (False,):
         structure = process.structure(integer=integer)
         for name in process.presets:
-            try:
+            with located(lambda field, name=name: field.replace("tuning", f"presets.{name}", 1)):
                 process.tuning(structure, name)
-            except InputError as error:
-                field = error.field.replace("tuning", f"presets.{name}", 1)
-                raise InputError(field, error.value, error.expected, error.hint) from None

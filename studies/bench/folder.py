@@ -15,6 +15,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from jaxmpc.check import located, require
 from jaxmpc.controller.case import Case, case_to_dict, load_case
 from jaxmpc.controller.plan import Plan, Planner
 from jaxmpc.errors import InputError
@@ -25,7 +26,6 @@ from studies.bench.generate import OPTIMA, shipped_cases
 from studies.bench.judge import FEASIBLE, repeated, tolerated
 from studies.bench.problem import objective, violation
 from studies.bench.rows import Found, Row
-from studies.definition.refusing import located, require
 
 TRUTH = "truth.json"
 PATIENCE = 60.0  # s that each solver has to certify an instance

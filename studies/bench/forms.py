@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from jaxmpc.check import require
 from studies.bench.problem import read, step_limits
-from studies.definition.refusing import require
 
 
 @dataclasses.dataclass

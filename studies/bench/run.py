@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from jaxmpc.check import require
 from jaxmpc.controller.case import case_to_dict
 from jaxmpc.files import write_atomically
 from jaxmpc.programs.interrupts import last_words
@@ -18,7 +19,6 @@ from studies.bench.instances import MODES
 from studies.bench.peers import MIQP_PEERS, QP_PEERS, Peer
 from studies.bench.rows import Report, Row, table
 from studies.bench.sections import exact, foreign, growth, loops, relaxed, startup, sweeps
-from studies.definition.refusing import require
 from studies.store.fingerprint import versions
 
 Section = Callable[[Context], Iterator[Row]]

@@ -17,9 +17,9 @@ from msgspec import UNSET
 from scipy.special import ndtri
 from scipy.stats import qmc
 
+from jaxmpc.check import require
 from jaxmpc.errors import InputError
 from studies.definition.fields import Field, find
-from studies.definition.refusing import require
 from studies.definition.sections import Axis, Distribution, Range
 from studies.definition.sweep import StudyDefinition
 from studies.definition.tables import read_columns, read_rows

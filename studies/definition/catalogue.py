@@ -15,13 +15,13 @@ from typing import Any
 
 import msgspec
 
+from jaxmpc.check import require
 from jaxmpc.decoding import decode
 from jaxmpc.errors import InputError
 from jaxmpc.files import read_named_toml
 from jaxmpc.process.file import load_process, windows_reference
 from jaxmpc.process.process import Process
 from studies.definition.comparison import ComparisonDefinition, ReferenceDefinition
-from studies.definition.refusing import require
 
 FOLDERS = "comparisons", "thesis/comparisons"
 INTEGER = {"kind": "mixed-integer", "actuator": "step"}  # of a controller that says nothing else

@@ -12,10 +12,10 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
+from jaxmpc.check import located, require
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
 from jaxmpc.process.process import Process
-from studies.definition.refusing import located, require
 from studies.definition.sections import ReferenceDefinition as ReferenceDefinition
 
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from identify.plants import model_of, open_plant
 from identify.working_point import check_mv
+from jaxmpc.check import require
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.process import Process
-from studies.definition.refusing import require
 
 Point = tuple[float, ...]  # a value per MV [MV unit]; empty where the model is given
 

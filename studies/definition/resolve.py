@@ -16,6 +16,7 @@ import numpy as np
 from msgspec import UNSET
 
 from identify.plants import open_plant
+from jaxmpc.check import located, require
 from jaxmpc.errors import InputError
 from jaxmpc.loop.noise import check_deviation, check_seed
 from jaxmpc.problem.structure import Structure
@@ -23,7 +24,6 @@ from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.problem.tuning import LIMIT_PAIRS
 from jaxmpc.process.reference import Reference
 from studies.definition.axes import AxisTable
-from studies.definition.refusing import located, require
 from studies.definition.sections import ReferenceDefinition
 from studies.definition.sweep import StudyDefinition
 

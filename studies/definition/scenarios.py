@@ -16,6 +16,7 @@ from msgspec import UnsetType
 
 from identify.plants import model_samples
 from jaxmpc import html
+from jaxmpc.check import require
 from jaxmpc.controller.measurement import SensorFault, fault_errors
 from jaxmpc.loop.events import Event, stages_of
 from jaxmpc.loop.trajectory import AXES
@@ -29,7 +30,6 @@ from studies.definition import models
 from studies.definition.axes import AxisTable, expand_axes
 from studies.definition.comparison import held
 from studies.definition.estimate import MODEL_SECONDS, Description, Work, chunk_seconds
-from studies.definition.refusing import require
 from studies.definition.resolve import Inputs, Variant, resolve, row
 from studies.definition.sweep import StudyDefinition
 from studies.store import fingerprint

@@ -7,13 +7,13 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import UNSET, UnsetType
 
+from jaxmpc.check import located, require
 from jaxmpc.controller.measurement import FAULTS
 from jaxmpc.loop.events import Event
 from jaxmpc.loop.trajectory import AXES
 from jaxmpc.process.file import DEFAULT_PROCESS
 from jaxmpc.process.process import Process
 from jaxmpc.process.reference import Reference
-from studies.definition.refusing import located, require
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 STORABLE = tuple(name for names in AXES.values() for name in names if name != "time")

@@ -18,6 +18,7 @@ from msgspec import UNSET
 from msgspec.structs import replace
 
 from identify.plants import parameters_of
+from jaxmpc.check import require
 from jaxmpc.controller.measurement import FAULTS
 from jaxmpc.decoding import decode
 from jaxmpc.errors import InputError, near
@@ -25,7 +26,6 @@ from jaxmpc.files import read_named_toml
 from jaxmpc.process.file import load_process, shipped_processes
 from jaxmpc.process.process import Process
 from studies.definition.fields import Field, find, study_fields
-from studies.definition.refusing import require
 from studies.definition.sections import (
     STORABLE,
     Axis,

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from jaxmpc.check import require
 from jaxmpc.errors import InputError, near
 from studies.definition.fields import Field
-from studies.definition.refusing import require
 
 
 def read_rows(folder: Path, name: str, place: str) -> tuple[list[str], list[list[str]]]:

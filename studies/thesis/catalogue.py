@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from jaxmpc.check import require
 from studies.definition.catalogue import Comparison, load_comparison
-from studies.definition.refusing import require
 from studies.run.named import run_named
 from studies.thesis.steady import steady_variables
 

@@ -11,8 +11,8 @@ import itertools
 import math
 from fractions import Fraction
 
+from jaxmpc.check import require
 from jaxmpc.errors import InputError
-from studies.definition.refusing import require
 
 Point = tuple[Fraction, Fraction]
 
