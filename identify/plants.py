@@ -21,7 +21,7 @@ from identify.working_point import facts_of
 from jaxmpc.errors import InputError, near
 from jaxmpc.model.step_response import StepResponseModel, make_model
 from jaxmpc.process.actuator import Actuator
-from jaxmpc.process.file import process_digest
+from jaxmpc.process.file import own_module, process_digest
 from jaxmpc.process.model_plant import ModelPlant
 from jaxmpc.process.plant import Parameter, Signals, disturbances_of
 from jaxmpc.process.process import PlantSource, Process
@@ -119,8 +119,8 @@ def imported(source: str, folder: Path, path: str) -> Any:
     """
     module, _, name = source.partition(":")
     try:
-        file = folder / f"{module}.py"
-        if file.is_file():
+        file = own_module(source, folder)
+        if file is not None:
             spec: Any = importlib.util.spec_from_file_location(f"jaxmpc_process_{module}", file)
             found = importlib.util.module_from_spec(spec)
             sys.modules[spec.name] = found  # so that what it defines can be sent to workers

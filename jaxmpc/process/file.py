@@ -205,10 +205,18 @@ def process_digest(process: Process) -> str:
         if path is not None and path.is_file():
             found.update(path.read_bytes())
         elif ":" in source:
-            module = util.find_spec(source.partition(":")[0])
-            if module is not None and module.origin:
-                found.update(Path(module.origin).read_bytes())
+            own = own_module(source, process.folder)
+            module = None if own else util.find_spec(source.partition(":")[0])
+            origin = own or (module and module.origin)
+            if origin:
+                found.update(Path(origin).read_bytes())
     return found.hexdigest()[:16]
+
+
+def own_module(source: str, folder: str | Path) -> Path | None:
+    """The file in the folder of a process that ``module:name`` means before any installed module; None without one."""
+    file = Path(folder) / f"{source.partition(':')[0]}.py"
+    return file if file.is_file() else None
 
 
 # -------------------------------------------------------------------------------------------------------- sections

@@ -12,7 +12,7 @@ from identify.judge import judge
 from identify.plants import load_model, model_of, open_plant
 from identify.step_test import settling
 from jaxmpc import Controller, InputError, Reference, simulate
-from jaxmpc.process.file import load_process, process_of, shipped_processes
+from jaxmpc.process.file import load_process, process_digest, process_of, shipped_processes
 from jaxmpc.process.library import pump_tank, quadruple_tank
 from studies.definition.catalogue import load_comparison
 from studies.definition.sweep import shipped_studies
@@ -265,3 +265,14 @@ def test_a_pair_twice_a_file_besides_and_a_point_of_nothing_are_refused():
         with pytest.raises(InputError) as error:
             process_of(body)
         assert error.value.field == f"model.{field}"
+
+
+def test_the_digest_of_a_process_knows_a_plant_in_its_folder(tmp_path):
+    body = written() | {"plants": {"own": {"kind": "python", "source": "own_plant:make"}}}
+    process, file = process_of(body, tmp_path), tmp_path / "own_plant.py"
+    digests = [process_digest(process)]
+    for code in ("make = 1", "make = 2", "make = 1"):
+        file.write_text(code)
+        digests.append(process_digest(process))
+    assert digests[1] == digests[3]
+    assert len(set(digests)) == 3
