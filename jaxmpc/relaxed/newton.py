@@ -54,6 +54,7 @@ INEXACT = (
 )
 NOTHING = 0.01  # gradient without moves, and moves, below which there is next to nothing to gain
 SETTLED, EXACT = 1e-7, 1e-12  # share of the gradient without moves left when prices are taken, and at the end
+OPEN = 0.1  # share of the tolerated gap that the gradient may leave at the end
 # 1e-10 ended a step of the thesis run too early
 ROUNDED, STALLED = 1e-11, 0.3  # share that rounding may be, and what a step then leaves of what there was
 # at the end, the last change of the prices, squared, and what it leaves hard rows violated by
@@ -309,10 +310,11 @@ def refine(problem: Prepared, start: WarmStart, most: Array | float = np.inf) ->
         alpha = _search(along, gradient @ way)
         point = moved(point, direction, alpha)
         prices = proximal.prices(point, state.prices)
-        left = jnp.max(jnp.abs(proximal.gradient(point.x, prices)))
+        force = proximal.gradient(point.x, prices)
+        left = jnp.max(jnp.abs(force))
         # where there is next to nothing to gain, the gap has to be small against a small share of the unit
         at_play = NOTHING + largest + jnp.max(jnp.abs(point.x))
-        exact = left < EXACT * at_play
+        exact = (left < EXACT * at_play) & (p.uncovered(point.x, force) < OPEN * p.tolerated)
         gained = jax.tree.map(lambda new, old: new - old, prices, state.prices)
         moving = _flat(jax.tree.map(jnp.divide, gained, proximal.sigma))
         change, owed = total(moving * _flat(gained)), total(jnp.abs(moving * _flat(prices)))

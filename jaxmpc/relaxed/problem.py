@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxmpc.problem.condense import CondensedQp
 from jaxmpc.problem.gram import gram
 from jaxmpc.problem.instance import QpInstance
+from jaxmpc.relaxed.gap import SMALLEST, reference
 from jaxmpc.status import FAILED, OPTIMAL
 
 FIXED = 1e-9  # box width [scaled moves] below which a variable is a constant
@@ -26,7 +27,6 @@ ACCEPTED = 1e-6  # relative duality gap up to which a solution counts as solved
 RIDGE = 1e-13  # on the diagonal of a Newton matrix, whose entries are of the order of one
 MANY = 16  # active CV limits from which on they are summed by where they change along the horizon
 SINGLE = 1e-9  # of the curvature of a single active CV limit that is left where its price cannot rise
-LEAST_SHARE = 1e-7  # of the solver unit: objectives below it have their gap measured against it
 
 
 class QpSolution(eqx.Module):
@@ -167,6 +167,23 @@ class Prepared(eqx.Module):
             common += summed.T @ (weight[:, None] * summed)
         return common
 
+    def uncovered(self, x: Float[Array, " n"], gradient: Float[Array, " n"]) -> Float[Array, ""]:
+        """What this much of a gradient that is left at x costs the bound: -min over the box of g'(z - x) + (z - x)'D (z - x).
+
+        D is the moves' own weight, which `hessian` surely holds of curvature unless chords have taken of it.
+        """
+        own = jnp.zeros_like(x) if self.position.size else 2.0 * self.qp.move_weight / self.unit
+        far, bowl = 10.0 * (1.0 + jnp.abs(x)), own > 0.0
+        low = jnp.where(bowl | jnp.isfinite(self.lower), self.lower - x, -far)
+        high = jnp.where(bowl | jnp.isfinite(self.upper), self.upper - x, far)
+        move = jnp.clip(-gradient / jnp.maximum(own, TINY), low, high)
+        return -total((gradient + 0.5 * own * move) * move)
+
+    @property
+    def tolerated(self) -> Float[Array, ""]:
+        """Gap that is accepted where the objective is next to nothing."""
+        return ACCEPTED * SMALLEST * self.qp.unit / self.unit
+
     def value(self, x, t) -> Float[Array, ""]:
         """Objective in its own unit at x with t = theta x + t0."""
         return _value(self.qp, self.instance, x, t)
@@ -296,7 +313,7 @@ def conclude(
 
     The bound is Lagrangian, with prices made dual feasible: soft(t) >= v t - soft*(v) with
     soft*(v) = c|v| + max(|v| - s, 0)^2 / (4 S), and rho max(0, w) >= sum of p w for p >= 0 with sum p <= rho. What is left
-    of the gradient in x is covered by the box of x.
+    of the gradient in x is covered by the box of x and the curvature of the moves' own weight.
 
     Args:
         problem: the lane.
@@ -332,16 +349,13 @@ def conclude(
     found -= jnp.sum(jnp.where(row_low > 0, row_low * (instance.row_low - wx), 0.0))
     gradient = qp.hessian @ x + problem.linear * problem.unit + problem.pull(net)
     gradient += jnp.sum(envelope, axis=0) + qp.rows.pull(pushed)
-    # the box of x is not priced but kept: min over the box of gradient'(z - x), curvature left out
-    lower, upper = problem.lower, problem.upper
-    reach_low = jnp.where(jnp.isfinite(lower), lower, x - 10.0 * (1.0 + jnp.abs(x)))
-    reach_high = jnp.where(jnp.isfinite(upper), upper, x + 10.0 * (1.0 + jnp.abs(x)))
-    found -= jnp.sum(jnp.minimum(gradient * (reach_low - x), gradient * (reach_high - x)))
+    # the box of x is not priced but kept
+    found += problem.uncovered(x, gradient / problem.unit) * problem.unit
     objective = problem.value(x, t)
-    relative = found / jnp.maximum(jnp.abs(objective), LEAST_SHARE * problem.unit)
+    relative = found / reference(objective, qp.unit)
     outside = jnp.maximum(wx - instance.row_high, instance.row_low - wx)
     broken = jnp.max(jnp.where(problem.takes_part, outside, -jnp.inf), initial=0.0)
-    good = (relative <= ACCEPTED) & (broken <= FEASIBLE) & ~jnp.any(lower > upper + FIXED)
+    good = (relative <= ACCEPTED) & (broken <= FEASIBLE) & ~jnp.any(problem.lower > problem.upper + FIXED)
     return QpSolution(
         x=x,
         objective=objective,

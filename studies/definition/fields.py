@@ -141,7 +141,7 @@ def as_text(value: Any) -> str:
         return f"{value:.10g}"
     return (
         "; ".join(map(as_text, value))
-        if isinstance(value[0], (list, tuple))
+        if value and isinstance(value[0], (list, tuple))
         else " ".join(str(v) for v in value)
     )
 

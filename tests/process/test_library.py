@@ -1,5 +1,6 @@
 """The shipped processes: published gains, time constants, steady states and zeros, by formulas of their own; and loops."""
 
+import dataclasses
 import math
 import tomllib
 from pathlib import Path
@@ -12,6 +13,7 @@ from identify.judge import judge
 from identify.plants import load_model, model_of, open_plant
 from identify.step_test import settling
 from jaxmpc import Controller, InputError, Reference, simulate
+from jaxmpc.cli.main import main
 from jaxmpc.process.file import load_process, process_digest, process_of, shipped_processes
 from jaxmpc.process.library import pump_tank, quadruple_tank
 from studies.definition.catalogue import load_comparison
@@ -276,3 +278,23 @@ def test_the_digest_of_a_process_knows_a_plant_in_its_folder(tmp_path):
         digests.append(process_digest(process))
     assert digests[1] == digests[3]
     assert len(set(digests)) == 3
+
+
+@pytest.mark.parametrize("move_weight", [0.1, 1e-5, 0.0])
+def test_a_relaxation_is_proven_where_next_to_nothing_is_left_to_gain(move_weight):
+    process = load_process("on-off-heater")
+    structure = dataclasses.replace(process.structure(), prediction_horizon=72, control_horizon=12, blocks=())
+    tuning = dataclasses.replace(process.tuning(structure), move_weight=np.array([move_weight]))
+    controller = Controller(structure, tuning, load_model(process))
+    run = simulate(controller, open_plant(process, actual=False), process.reference("quick"), samples=120)
+    assert np.min(run.objective) < 1e-3  # of a curvature of 314
+    assert (run.status == 0).all()
+    assert np.max(run.gap) <= 1e-6
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_keys_of_a_shipped_process_are_listed(name, capsys):
+    assert main(["process", "keys", name]) == 0
+    listed = capsys.readouterr().out
+    for key in (str(axis.key) for axis in load_study(name, quick=True).definition.axes if axis.key):
+        assert f"\n{key} " in listed
