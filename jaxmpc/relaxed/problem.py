@@ -168,7 +168,7 @@ class Prepared(eqx.Module):
         return common
 
     def uncovered(self, x: Float[Array, " n"], gradient: Float[Array, " n"]) -> Float[Array, ""]:
-        """What this much of a gradient that is left at x costs the bound: -min over the box of g'(z - x) + (z - x)'D (z - x).
+        """What a gradient g that is left at x costs the bound: -min over the box of g'(z - x) + (z - x)'D (z - x).
 
         D is the moves' own weight, which `hessian` surely holds of curvature unless chords have taken of it.
         """
