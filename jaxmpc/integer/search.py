@@ -26,7 +26,7 @@ from jaxmpc.programs.lanes import one_by_one
 from jaxmpc.relaxed.gap import closes, cutoff
 from jaxmpc.relaxed.newton import WarmStart, warm_start_of
 from jaxmpc.relaxed.problem import evaluate
-from jaxmpc.relaxed.solve import solve_lane
+from jaxmpc.relaxed.solve import solve_relaxed
 from jaxmpc.status import OPTIMAL, finisher_code
 
 MOST_SOLVED = 64  # of a list
@@ -64,7 +64,7 @@ def relax(
     most: Array | float = jnp.inf,
 ) -> Relaxed:
     """Relax one problem within limits of the moves, and evaluate its moves with the integer ones, if any, rounded."""
-    s = solve_lane(qp, instance, lower, upper, start, most)
+    s = solve_relaxed(qp, instance, lower, upper, start, most)
     if not integers:
         return Relaxed(warm_start_of(s), s.objective, s.bound, s.objective, s.status, s.iterations)
     snapped = jnp.where(qp.whole, jnp.round(s.x), s.x)
@@ -121,7 +121,6 @@ class _State(NamedTuple):
     root: Relaxed
 
 
-@one_by_one
 def decide(
     qp: CondensedQp,
     tables: Tables,
@@ -140,18 +139,38 @@ def decide(
         gap: relative gap at which a solve is optimal.
         most: Newton steps of all its relaxations, or as much other work, after which it gives up.
     """
-    search = _Search(qp, tables, instance, jnp.asarray(gap, dtype=float), jnp.asarray(most, dtype=float))
+    if tables.column.shape[0]:
+        return _searched(qp, tables, instance, start, jnp.asarray(gap, float), jnp.asarray(most, float))
+    root = relax(qp, instance, instance.lower, instance.upper, start, False, most)
+    solved = root.status == OPTIMAL
+    return Decision(
+        closed=solved,
+        x=root.warm.x,
+        value=root.objective,
+        bound=jnp.minimum(
+            jnp.maximum(root.bound, 0.0), root.objective
+        ),  # every term of (6.6) is non-negative
+        finished_by=jnp.where(solved, finisher_code("relaxation"), 0),
+        nodes=jnp.ones((), dtype=int),
+        steps=root.steps.astype(int),
+        root=root,
+    )
+
+
+@one_by_one
+def _searched(
+    qp: CondensedQp, tables: Tables, instance: QpInstance, start: WarmStart, gap: Array, most: Array
+) -> Decision:
+    """`decide` where there may be whole moves; lane by lane, so that the relaxations of none wait for those of others."""
+    search = _Search(qp, tables, instance, gap, most)
 
     def visit(state: _State) -> _State:
         """Solve what is next, and choose what to solve after it."""
-        integers = tables.column.shape[0] > 0
         left = jnp.maximum(search.most - state.work, 0.0)
-        result = relax(qp, instance, state.lower, state.upper, state.root.warm, integers, left)
+        result = relax(qp, instance, state.lower, state.upper, state.root.warm, most=left)
         state = state._replace(
             solved=state.solved + 1, steps=state.steps + result.steps, work=state.work + result.steps
         )
-        if not integers:
-            return search.begun(state, result)
         return jax.lax.cond(state.solved == 1, search.begun, search.after, state, result)
 
     state = jax.lax.while_loop(lambda state: state.open, visit, search.start(start))
@@ -199,15 +218,14 @@ class _Search(NamedTuple):
         """Before the relaxation."""
         number, whole = jnp.zeros(()), jnp.zeros((), dtype=int)
         infinite, no = jnp.asarray(jnp.inf), jnp.asarray(False)
-        longest = listing.LONGEST if self.tables.column.shape[0] else 0
         root = Relaxed(warm, number, -infinite, infinite, whole, whole.astype(jnp.int32))
         return _State(
             lower=self.instance.lower,
             upper=self.instance.upper,
             point=jnp.zeros(self.tables.column.shape[0]),
             expected=-infinite,
-            codes=jnp.zeros(longest, dtype=int),
-            bounds=jnp.full(max(longest, 1), jnp.inf),
+            codes=jnp.zeros(listing.LONGEST, dtype=int),
+            bounds=jnp.full(listing.LONGEST, jnp.inf),
             count=whole,
             value=infinite,
             x=jnp.zeros_like(self.instance.lower),

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxmpc.programs.lanes import one_by_one
 from jaxmpc.relaxed.problem import (
     RIDGE,
     TINY,
@@ -279,7 +280,28 @@ def refine(problem: Prepared, start: WarmStart, most: Array | float = np.inf) ->
     Returns:
         The solution, judged by `relaxed.problem.conclude`.
     """
-    p, keep, unit = problem, problem.keep, problem.unit
+    x, found, steps = _solved(problem, *_begin(problem, start), jnp.asarray(most, dtype=float))
+    x = jnp.clip(x, problem.lower, problem.upper)
+    prices = jax.tree.map(lambda prices: problem.unit * prices, found)
+    return conclude(problem, x, prices, steps)
+
+
+def _begin(p: Prepared, start: WarmStart) -> tuple[Float[Array, " n"], _Families]:
+    """Moves and prices of a lane that starts from a neighbouring problem."""
+    prices = _Families(
+        row=jnp.where(p.curvature + p.steepness > 0.0, start.row_price / p.unit, 0.0),
+        envelope=jnp.where(p.steep > 0.0, start.envelope_price / p.unit, 0.0),
+        position=start.position_price / p.unit,
+        limit=start.limit_price / p.unit,
+        box=p.keep * start.box_price / p.unit,
+        hard=jnp.where(p.takes_part, start.hard_price / p.unit, 0.0),
+    )
+    return jnp.where(p.free, jnp.clip(start.x, p.lower, p.upper), 0.5 * (p.lower + p.upper)), prices
+
+
+@one_by_one
+def _solved(p: Prepared, x: Float[Array, " n"], prices: _Families, most: Float[Array, ""]):
+    """``(x, prices, steps)`` of a lane when it is solved, or after so many steps, from moves and prices."""
     largest = jnp.max(jnp.abs(p.linear))
 
     def moved(point: _Point, direction: _Point, alpha) -> _Point:
@@ -293,7 +315,7 @@ def refine(problem: Prepared, start: WarmStart, most: Array | float = np.inf) ->
         gradient = proximal.gradient(point.x, prices)
         matrix = p.proximal_matrix(proximal.slopes(point, state.prices, prices), state.ridge)
         way = -solve_positive(matrix, gradient)
-        dx = keep * way
+        dx = p.keep * way
         direction = _Point(dx, p.respond(dx), p.qp.rows.of(dx))
         bend, slope = dx @ (p.hessian @ dx), (p.hessian @ point.x + p.linear) @ dx
 
@@ -344,18 +366,23 @@ def refine(problem: Prepared, start: WarmStart, most: Array | float = np.inf) ->
         again = state._replace(ridge=1e2 * state.ridge, steps=state.steps + 1)
         after = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, again)
         anew = (after.steps % STEPS == 0) & unfinished(after)
-        fresh = nothing._replace(steps=after.steps, stiffness=jnp.asarray(ATTEMPTS)[after.steps // STEPS, 0])
-        return jax.lax.cond(anew, lambda: fresh, lambda: after)
+        return jax.lax.cond(anew, lambda: fresh(after.steps), lambda: after)
+
+    def fresh(steps) -> _State:
+        middle = jnp.where(p.free, jnp.clip(0.0, p.lower, p.upper), x)
+        nothing = _at(p, middle, jax.tree.map(jnp.zeros_like, prices))
+        return nothing._replace(steps=steps, stiffness=jnp.asarray(ATTEMPTS)[steps // STEPS, 0])
 
     def unfinished(state: _State):
         return ~state.done & (state.steps < jnp.minimum(most, MOST_STEPS))
 
-    nothing = _begin(p, jax.tree.map(jnp.zeros_like, start))
-    state = jax.lax.while_loop(unfinished, step, _begin(p, start))
-    x = jnp.clip(state.point.x, p.lower, p.upper)
-    found = jax.tree.map(lambda prices: unit * prices, state.prices)
-    prices = Prices(found.row, found.envelope, found.position, found.limit, found.hard)
-    return conclude(p, x, prices, state.steps)
+    last = jax.lax.while_loop(unfinished, step, _at(p, x, prices))
+    found = last.prices
+    return (
+        last.point.x,
+        Prices(found.row, found.envelope, found.position, found.limit, found.hard),
+        last.steps,
+    )
 
 
 def _flat(families: _Families) -> Array:
@@ -363,21 +390,11 @@ def _flat(families: _Families) -> Array:
     return jnp.concatenate([jnp.ravel(v) for v in families])
 
 
-def _begin(p: Prepared, start: WarmStart) -> _State:
-    """The first point and prices of a lane."""
-    x = jnp.where(p.free, jnp.clip(start.x, p.lower, p.upper), 0.5 * (p.lower + p.upper))
-    t = p.respond(x) + p.instance.offset
-    prices = _Families(
-        row=jnp.where(p.curvature + p.steepness > 0.0, start.row_price / p.unit, 0.0),
-        envelope=jnp.where(p.steep > 0.0, start.envelope_price / p.unit, 0.0),
-        position=start.position_price / p.unit,
-        limit=start.limit_price / p.unit,
-        box=p.keep * start.box_price / p.unit,
-        hard=jnp.where(p.takes_part, start.hard_price / p.unit, 0.0),
-    )
+def _at(p: Prepared, x: Float[Array, " n"], prices: _Families) -> _State:
+    """Before the first step, from these moves and prices."""
     priced = jnp.any(_flat(prices) != 0.0)
     return _State(
-        point=_Point(x, t, p.qp.rows.of(x)),
+        point=_Point(x, p.respond(x) + p.instance.offset, p.qp.rows.of(x)),
         prices=prices,
         stiffness=jnp.where(priced, STIFF, SOFT),
         ridge=jnp.asarray(RIDGE),

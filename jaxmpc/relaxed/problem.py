@@ -170,9 +170,10 @@ class Prepared(eqx.Module):
     def uncovered(self, x: Float[Array, " n"], gradient: Float[Array, " n"]) -> Float[Array, ""]:
         """What a gradient g that is left at x costs the bound: -min over the box of g'(z - x) + (z - x)'D (z - x).
 
-        D is the moves' own weight, which `hessian` surely holds of curvature unless chords have taken of it.
+        D is the moves' own weight, which `hessian` surely holds of curvature. It is left to what the search for whole moves
+        makes of bounds and curvature where there are any.
         """
-        own = jnp.zeros_like(x) if self.position.size else 2.0 * self.qp.move_weight / self.unit
+        own = jnp.where(jnp.any(self.qp.whole), 0.0, 2.0 * self.qp.move_weight / self.unit)
         far, bowl = 10.0 * (1.0 + jnp.abs(x)), own > 0.0
         low = jnp.where(bowl | jnp.isfinite(self.lower), self.lower - x, -far)
         high = jnp.where(bowl | jnp.isfinite(self.upper), self.upper - x, far)

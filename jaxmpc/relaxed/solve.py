@@ -16,7 +16,6 @@ from jaxtyping import Array, Float
 
 from jaxmpc.problem.condense import CondensedQp
 from jaxmpc.problem.instance import QpInstance
-from jaxmpc.programs.lanes import one_by_one
 from jaxmpc.relaxed.newton import WarmStart, refine
 from jaxmpc.relaxed.problem import QpSolution, prepare
 
@@ -27,6 +26,7 @@ def solve_relaxed(
     lower: Float[Array, " n"],
     upper: Float[Array, " n"],
     start: WarmStart | None = None,
+    most: Array | float = np.inf,
 ) -> QpSolution:
     """Solve one relaxed problem (one lane; use `jax.vmap` for a batch).
 
@@ -35,19 +35,13 @@ def solve_relaxed(
         instance: offsets and limits of this sample.
         lower, upper: limits of x; equal limits fix a move.
         start: moves and prices of a neighbouring problem, None to start cold.
+        most: Newton steps at most; the certificate is what they reach.
 
     Returns:
         `QpSolution` with status `OPTIMAL` if its duality gap is at most 1e-6 and the hard rows hold to 1e-8 [scaled moves],
         else `FAILED`; `residual` is the larger of gap and violation.
     """
-    return solve_lane(qp, instance, lower, upper, cold_start(qp, instance) if start is None else start)
-
-
-@one_by_one
-def solve_lane(
-    qp: CondensedQp, instance: QpInstance, lower, upper, start: WarmStart, most: Array | float = np.inf
-) -> QpSolution:
-    """`solve_relaxed` from a start, in so many Newton steps at most; its certificate is what they reach."""
+    start = cold_start(qp, instance) if start is None else start
     return refine(prepare(qp, instance, lower, upper), start, most)
 
 

@@ -85,7 +85,7 @@ class Description:
             "groups": f"{len(sizes)} of equal structure and length, of {listed} scenarios",
             "chunks": self.chunks,
             "to compile": self.compilations,
-            "models": f"{self.models} to identify",
+            "models": f"{self.models} to identify" if self.models else "given by the process",
             "stored": f"{megabytes(self.stored_bytes)} before compression",
             "time": f"about {minutes} on 2 CPU cores; the run measures it by its own chunks",
         }

@@ -254,16 +254,17 @@ class Study:
         widths = {"": 1, "cv": len(self.process.cvs), "mv": len(self.process.mvs)}
         kept = sum(widths[axis] * len(set(names) & set(store.trajectories)) for axis, names in AXES.items())
         points = math.ceil(max(group.samples for group in self.groups) / store.every)
+        identified = 0 if self.process.model.given else len(self.model_points)
         return Description(
             name=self.name,
             scenarios=self.count,
             group_sizes=tuple(len(group.scenarios) for group in self.groups),
             chunks=len(self.chunks),
             compilations=len({(*group.program, self.lanes(i)) for i, group in enumerate(self.groups)}),
-            models=len(self.model_points),
+            models=identified,
             samples=sum(len(group.scenarios) * group.samples for group in self.groups),
             stored_bytes=self.count * (KEY_FIGURES + kept * points) * NUMBER_BYTES,
-            seconds=MODEL_SECONDS * len(self.model_points) + self.work.rest({}),
+            seconds=MODEL_SECONDS * identified + self.work.rest({}),
         )
 
     def _repr_html_(self) -> str:

@@ -154,17 +154,17 @@ class SearchStudy:
     def describe(self) -> Description:
         """What a run would do, for a dry run; prints as a short table."""
         group, each = self.probe.groups[0], self.probe.describe()
-        models, samples = len(self.probe.model_points), self.count * group.samples
+        samples = self.count * group.samples
         return Description(
             name=self.name,
             scenarios=self.count,
             group_sizes=(self.count,),
             chunks=self.batches,
             compilations=1,
-            models=models,
+            models=each.models,
             samples=samples,
             stored_bytes=each.stored_bytes // each.scenarios * self.count,
-            seconds=MODEL_SECONDS * models + self.work.rest({}),
+            seconds=MODEL_SECONDS * each.models + self.work.rest({}),
             searched=True,
         )
 

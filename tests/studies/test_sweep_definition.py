@@ -541,6 +541,10 @@ def test_a_dry_run_counts_scenarios_compilations_models_and_bytes():
     assert description.stored_bytes == 6 * 8 * (64 + 10 * 3)
     assert description.seconds == pytest.approx(3 * MODEL_SECONDS + made.work.rest({}))
     assert "scenarios   6" in str(description)
+    assert "models      3 to identify" in str(description)
+    given = load_study("wood-berry", quick=True).describe()
+    assert given.models == 0
+    assert "models      given by the process" in str(given)
 
 
 @pytest.mark.parametrize("name", ["blocking", "deadzone", "mismatch", "robustness"])
