@@ -29,6 +29,7 @@ def new_process(
     *,
     steps: Mapping[str, float] | None = None,
     switches: Sequence[str] = (),
+    limits: Mapping[str, tuple[float, float]] | None = None,
 ) -> tuple[str, list[str]]:
     """The text of a process file for a model, and what was guessed for it.
 
@@ -38,6 +39,7 @@ def new_process(
         name: of the process.
         steps: sizes of the steps of MVs that do not take every value [MV unit].
         switches: MVs that are on or off.
+        limits: low and high of MVs, where they are known [MV unit].
 
     Returns:
         ``(text, guesses)``.
@@ -50,7 +52,7 @@ def new_process(
     point = dict(model.working_point)
     cv_units, mv_units = (units or ("1",) * len(names) for units, names in _names(model))
     ranges = {
-        mv: _range(unit, point.get(mv), mv in switches)
+        mv: (limits or {}).get(mv) or _range(unit, point.get(mv), mv in switches)
         for mv, unit in zip(model.mv_names, mv_units, strict=True)
     }
     spans = np.array([(high - low) / (1 if mv in switches else 4) for mv, (low, high) in ranges.items()])
