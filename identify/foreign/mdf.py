@@ -202,9 +202,15 @@ def pair_of(path: Path, cvs: Sequence[str], inputs: Sequence[str]) -> tuple[str,
     raise InputError(str(path), stem, expected, hint)
 
 
+def models_in(folder: Path) -> list[Path]:
+    """Model files of a folder; a document that is called ``.pdf`` is none."""
+    found = (path for path in sorted(folder.glob("*")) if path.suffix.lower() in SUFFIXES and path.is_file())
+    return [path for path in found if not path.read_bytes().startswith(b"%PDF-")]
+
+
 def refuse_occupied(folder: Path) -> None:
     """Refuse a folder that has an application in it: its files may be the only ones of a plant."""
-    there = sorted(p.name for p in folder.glob("*") if p.suffix.lower() in (*SUFFIXES, ".cnfg"))
+    there = [path.name for path in (*folder.glob("*.cnfg"), *models_in(folder))]
     require(
         not there,
         "--out",

@@ -17,12 +17,18 @@ from identify.foreign.cnfg import Block
 from identify.foreign.common import Asked, Imported, Pairs, assemble, foreign_names
 from identify.foreign.septic_application import Application, application_of
 from identify.foreign.septic_meaning import Report
+from identify.foreign.septic_tuning import NO_LIMIT
 from jaxmpc.check import require
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.new import new_process
 
-NO_LIMIT = 1e10  # size of a limit that is none
+DEFAULTS = {  # attributes whose defaults are used where they are left out
+    "Appl": ("Nhorz", "Npred"),
+    "Mvr": ("Span", "MaxUp", "MaxDn", "MovePnlty", "Blocking"),
+    "Cvr": ("Span", "Fulf", "HighPnlty", "LowPnlty"),
+    "Dvr": ("Span",),
+}
 
 
 class Converted(NamedTuple):
@@ -52,16 +58,17 @@ class Choices:
 
 def files_in(given: Sequence[Path]) -> tuple[Path | None, list[Path]]:
     """The configuration, if there is one, and the model files of files and folders."""
-    found = [path for one in given for path in (sorted(one.iterdir()) if one.is_dir() else [one])]
-    configurations = [path for path in found if path.suffix.lower() == ".cnfg"]
+    folders = [path for path in given if path.is_dir()]
+    named = [path for path in given if not path.is_dir()]
+    configurations = [path for path in named if path.suffix.lower() == ".cnfg"]
+    configurations += [path for folder in folders for path in sorted(folder.glob("*.cnfg"))]
     if len(configurations) > 1:
         listed = ", ".join(path.name for path in configurations)
         raise InputError("FILE", [str(path) for path in given], "one .cnfg file", f"Name one of {listed}")
-    models = [path for path in found if path.suffix.lower() in mdf.SUFFIXES]
-    if configurations and not models:  # the file alone was named: its models lie beside it
-        models = [
-            path for path in sorted(configurations[0].parent.iterdir()) if path.suffix.lower() in mdf.SUFFIXES
-        ]
+    models = [path for path in named if path.suffix.lower() in mdf.SUFFIXES]
+    if configurations and not models and not folders:  # the file alone was named: its models lie beside it
+        folders = [configurations[0].parent]
+    models += [path for folder in folders for path in mdf.models_in(folder)]
     return (configurations[0] if configurations else None), models
 
 
@@ -71,7 +78,13 @@ def read_models(given: Sequence[Path], asked: Asked) -> Imported:
     require(files, "FILE", [str(path) for path in given], "model files: .mdf or .pdf")
     if configuration is None or asked.cvs:
         return mdf.read(files, asked)
-    own = application_of(configuration)
+    try:
+        own = application_of(configuration)
+    except InputError as error:
+        hint = (
+            "Name the model files, and --cv, --mv and --dv" if error.field == "--application" else error.hint
+        )
+        raise InputError(error.field, error.value, error.expected, hint) from None
     return assemble(_responses(own, files, asked), _timed(own, asked), "SEPTIC model files")
 
 
@@ -123,11 +136,35 @@ def read_application(given: Path, model_file: str, name: str, asked: Asked, choi
         report.notes.append(
             f"sampling interval {model.dt:g} s, that of the model files: the configuration has no Nsecs"
         )
+    report.notes += _looks(own)
     ours = {old: new for new, old in foreign_names(model).items()}
     body = _body(own, model, model_file, name, choices, ours, limits, report)
     septic_tuning.fill(body, own, choices.weights, asked.time_unit, ours, report)
     report.take(own.blocks, own.others)
     return Converted(body, model, report)
+
+
+def _looks(own: Application) -> list[str]:
+    """What makes the model mean something else, and which defaults are used."""
+    out = []
+    for block in own.cvs:
+        if block.number("Integ", "0, or 1 for an open integrator", 0):
+            out.append(
+                f"look: {block.name} integrates (Integ); the model holds its last value and predicts too little after it"
+            )
+        if block.word("TransformType", "NOTRANS") != "NOTRANS":
+            out.append(
+                f"look: the model of {block.name} is that of a transformed value (TransformType), which is not undone here"
+            )
+    groups = {"Appl": (own.head,), "Mvr": own.mvs, "Cvr": own.cvs, "Dvr": own.dvs}
+    left: dict[str, list[str]] = {}
+    for kind, keys in DEFAULTS.items():
+        for key in keys:
+            left.setdefault(key, []).extend(block.name for block in groups[kind] if block.find(key) is None)
+    told = [f"{key} of {', '.join(names)}" for key, names in left.items() if names]
+    return out + (
+        [f"left out, so with the default of the public description: {'; '.join(told)}"] if told else []
+    )
 
 
 def _limits(block: Block, report: Report) -> tuple[float, float]:

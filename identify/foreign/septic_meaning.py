@@ -109,11 +109,9 @@ MEANINGS: Mapping[str, Mapping[str, Meaning]] = {
         **_all("MaxUp MaxDn", "equal", "move, move_high, move_low"),
         "MovePnlty": Meaning("approximated", "move_weight; how it enters there is not documented"),
         "Blocking": Meaning("equal", "blocks of this MV"),
-        **_all(
-            "IvOn IvOff SSval",
-            "none",
-            "ideal value: an input target, from Python only (jaxmpc.controller.targets)",
-        ),
+        "IvOn": Meaning("none", "ideal value: an input target, from Python only (jaxmpc.controller.targets)"),
+        "IvOff": Meaning("none", "ideal value, off at the start"),
+        "SSval": Meaning("none", "a result, no setting"),
         **_all("IvRoc IvFilt IvPrio Fulf FulfReScale FulfDynScale", "none", "belongs to the ideal value"),
         "Price": Meaning("none", "prices of MVs: the real-time optimiser is another layer", ("0",)),
         "PVPred": Meaning("approximated", "a setting of studies: position_feedback = true", ("OFF",)),
@@ -126,7 +124,7 @@ MEANINGS: Mapping[str, Mapping[str, Meaning]] = {
     "Cvr": {
         **VARIABLE,
         "Meas": Meaning("approximated", "where the CV stands at the start: working point"),
-        "SetPntOn": Meaning("equal", "setpoint: reference setpoints"),
+        "SetPntOn": Meaning("equal", "a row of the reference setpoints"),
         "SetPntOff": Meaning("approximated", "no setpoint, off at the start: cv_weight is 0"),
         "HighOn": Meaning("equal", "high"),
         "LowOn": Meaning("equal", "low"),

@@ -162,7 +162,7 @@ def _number(value: float) -> str:
 def _described(variable: Variable, at: float) -> dict[str, Any]:
     unit = "" if variable.unit == "1" else variable.unit
     return {
-        "Text1": Text(variable.label),
+        "Text1": Text("" if variable.label == variable.name.replace("_", " ") else variable.label),
         "Text2": Text(""),
         "Mode": "STOPPED",
         "Unit": Text(unit),

@@ -13,6 +13,7 @@ from identify.foreign.septic_application import Application
 from identify.foreign.septic_meaning import Report
 from jaxmpc.check import require
 
+NO_LIMIT = 1e10  # size of a limit that is none
 DEFAULT_BLOCKS = (2, 4, 7, 11, 16, 22)
 DEFAULT_HORIZON = 80
 # deadband: a calculation that takes the weight of a CV away while another one says that it is inside
@@ -208,12 +209,12 @@ def moves_of(block: Block) -> tuple[float, float]:
 
 
 def _moves(preset: dict[str, Any], own: Application, body: dict[str, Any], ours: Mapping[str, str]) -> None:
-    """Moves that are not as large down as up."""
+    """Moves that are not as large down as up; what is on or off has no limit of moves."""
     for block, entry in zip(own.mvs, body["mv"], strict=True):
         up, down = moves_of(block)
-        if up != -down and "move" in entry:
-            preset.setdefault("move_high", {})[ours[block.name]] = up
-            preset.setdefault("move_low", {})[ours[block.name]] = down
+        if up != -down and entry.get("actuator", {}).get("kind") != "on-off":
+            preset.setdefault("move_high", {})[ours[block.name]] = up if up < NO_LIMIT else math.inf
+            preset.setdefault("move_low", {})[ours[block.name]] = down if -down < NO_LIMIT else -math.inf
     for key, sign in (("move_high", 1), ("move_low", -1)):
         for entry in body["mv"] if key in preset else ():
             preset[key].setdefault(entry["name"], sign * entry.get("move", math.inf))
@@ -234,10 +235,10 @@ def _measurements(preset: dict[str, Any], own: Application, ours: Mapping[str, s
                 report.say(
                     block,
                     key,
-                    "equal" if abs(value) >= 1e10 else "approximated",
+                    "equal" if abs(value) >= NO_LIMIT else "approximated",
                     "not in force: MeasValidation is OFF",
                 )
-            elif abs(value) < 1e10:
+            elif abs(value) < NO_LIMIT:
                 preset.setdefault(f"measurement_{side.lower()}", {})[name] = value
         limit = block.number("BadCntLim", "bad measurements in a row", 0)
         if limit:
