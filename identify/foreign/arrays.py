@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from identify.foreign.common import (
     shifted,
     units_of,
 )
-from jaxmpc.check import require, sound
+from jaxmpc.check import is_number, require, sound
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
 from jaxmpc.model.step_response import StepResponseModel
@@ -53,14 +54,12 @@ def read(files: Sequence[Path], asked: Asked) -> Imported:
         if len(units):
             require(len(units) == count, f"{path}: {kind}_units", units.tolist(), f"{count} units")
             pairs.units |= dict(zip(own, map(str, units), strict=True))
-    dt = asked.dt if asked.dt is not None and "dt" not in held else np.ravel(held.get("dt", [0]))[0]
+    interval = np.atleast_1d(held.get("dt", asked.dt or ()))
+    good = interval.size == 1 and np.issubdtype(interval.dtype, np.number) and is_number(interval[0])
     require(
-        isinstance(dt, (int, float, np.number)) and dt > 0,
-        "--dt",
-        None,
-        "the sampling interval [s]",
-        f"{path} has none",
+        good and interval[0] > 0, "--dt", interval.tolist(), "the sampling interval [s]", f"{path} has none"
     )
+    dt = float(interval[0])
     firsts = {
         f"{path}: {kind} {i}, {j}": row[j]
         for kind, a in arrays.items()
@@ -73,7 +72,7 @@ def read(files: Sequence[Path], asked: Asked) -> Imported:
             for j, of in enumerate(getattr(pairs, f"{kind}s")):
                 kept, lost = shifted(array[i, j], first, f"{path}: {of} on {cv}")
                 pairs.notes += [lost] if lost else []
-                pairs.add(str(path), cv, of, Curve(float(dt), kept))
+                pairs.add(str(path), cv, of, Curve(dt, kept))
     pairs.notes += [said, *(f"unknown: {key} ({path})" for key in held if key not in KNOWN)]
     return assemble(pairs, asked, "NumPy")
 
@@ -86,7 +85,7 @@ def _held(path: Path) -> dict[str, Any]:
             return {"coefficients": given}
         with given:
             return {key: given[key] for key in given.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, KeyError, OverflowError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError("file", str(path), f"NumPy arrays without Python objects ({error})") from None
 
 

@@ -5,6 +5,7 @@ Every reader collects a `Curve` per pair and calls `assemble`, which says what i
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import math
 import re
@@ -16,11 +17,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxmpc.check import LARGEST, is_number
+from jaxmpc.check import LARGEST, is_count, is_number, require
 from jaxmpc.errors import InputError, near
 from jaxmpc.model.step_response import StepResponseModel, make_model
 
 LONGEST_NAME = 64
+LONGEST = 100_000  # coefficients of a response, beyond which a number cannot be meant
 TIME_UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
 
@@ -45,6 +47,15 @@ class Asked:
     first_entry: int | None = None
     which: Literal["A", "B"] = "A"
     time_unit: str = "s"
+
+    def check(self) -> None:
+        """Refuse numbers that cannot be."""
+        for option, names in (("--cv", self.cvs), ("--mv", self.mvs), ("--dv", self.dvs)):
+            require(len(set(names)) == len(names), option, list(names), "each name once")
+        good = self.dt is None or (is_number(self.dt) and self.dt > 0)
+        require(good, "--dt", self.dt, "a positive sampling interval [s]")
+        good = self.samples is None or (is_count(self.samples) and self.samples <= LONGEST)
+        require(good, "--samples", self.samples, f"1 to {LONGEST} coefficients")
 
 
 class Imported(NamedTuple):
@@ -100,6 +111,19 @@ def read_text(path: Path) -> str:
         if "\0" not in text and not text.startswith("%PDF-"):
             return text
     raise InputError("file", str(path), "a text file")
+
+
+def csv_rows(text: str, path: Path, separator: str = ",") -> list[tuple[str, list[str]]]:
+    """The rows of a table that have something in them, without spaces around cells, by ``file:line``."""
+    rows, out = csv.reader(text.splitlines(), delimiter=separator), []
+    try:
+        for row in rows:
+            cells = [cell.strip() for cell in row]
+            if any(cells) and not cells[0].startswith("#"):
+                out.append((f"{path}:{rows.line_num}", cells))
+    except csv.Error as error:
+        raise InputError(f"{path}:{rows.line_num}", str(error), "a row of a table") from None
+    return out
 
 
 def number(text: Any, where: str, what: str) -> float:
@@ -164,6 +188,12 @@ def resampled(curve: Curve, dt: float) -> tuple[Curve, str]:
     whole = abs(ratio - round(ratio)) < 1e-9 * ratio and round(ratio) >= 1
     ratio = round(ratio) if whole else ratio
     count = max(math.ceil(len(curve.values) / ratio - 1e-9), 1)
+    require(
+        count <= LONGEST,
+        "--dt",
+        dt,
+        f"an interval that makes no more than {LONGEST} coefficients of {curve.dt:g} s",
+    )
     at = np.arange(1, count + 1) * ratio
     values = np.interp(at, np.arange(len(curve.values) + 1), np.concatenate([[0.0], curve.values]))
     how = f"every {round(ratio)}. value" if whole else "linear between values"
@@ -187,8 +217,6 @@ def assemble(found: Pairs, asked: Asked, origin: str) -> Imported:
         listed = ", ".join(f"{dt:g} s" for dt in intervals)
         raise InputError("--dt", None, f"a sampling interval: the responses have {listed}", "Give --dt")
     dt = intervals[0] if asked.dt is None else asked.dt
-    if not is_number(dt) or dt <= 0:
-        raise InputError("--dt", dt, "a positive sampling interval [s]")
     curves, said = {}, dict[str, list[str]]()
     for (cv, of), curve in found.curves.items():
         curves[cv, of], how = resampled(curve, dt)

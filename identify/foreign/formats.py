@@ -15,22 +15,29 @@ from jaxmpc.model.step_response import StepResponseModel
 
 
 class Format(NamedTuple):
-    """A format; a written one is a folder of files or a single file with one of the suffixes."""
+    """A format.
+
+    Attributes:
+        suffixes: of its files; a file that is written has one of `targets`, or they stand in a folder.
+    """
 
     title: str
     read: Callable[[Sequence[Path], Asked], Imported]
     write: Callable[[StepResponseModel, Path, Asked], tuple[list[Path], list[str]]] | None
     suffixes: tuple[str, ...]
-    folder: bool = False
+    targets: tuple[str, ...] = ()
+
+    @property
+    def folder(self) -> bool:
+        """Whether it is a folder of files."""
+        return not self.targets and self.write is not None
 
 
 FORMATS = {
-    "septic": Format(
-        "SEPTIC model files", septic.read_models, mdf.write, (*mdf.SUFFIXES, ".cnfg"), folder=True
-    ),
-    "lightweight": Format("Light-weight-MPC", lightweight.read, lightweight.write, (".json",)),
-    "neqsim": Format("NeqSim", neqsim.read, neqsim.write, (".json", ".csv")),
-    "numpy": Format("NumPy", arrays.read, arrays.write, (".npz", ".npy")),
+    "septic": Format("SEPTIC model files", septic.read_models, mdf.write, (*mdf.SUFFIXES, ".cnfg")),
+    "lightweight": Format("Light-weight-MPC", lightweight.read, lightweight.write, (".json",), (".json",)),
+    "neqsim": Format("NeqSim", neqsim.read, neqsim.write, (".json", ".csv"), (".json", ".csv")),
+    "numpy": Format("NumPy", arrays.read, arrays.write, (".npz", ".npy"), (".npz",)),
     "transfer-functions": Format("transfer functions", tables.read, None, (".csv", ".toml")),
 }
 WRITTEN = tuple(name for name, form in FORMATS.items() if form.write)
@@ -49,6 +56,8 @@ def import_model(given: Sequence[Path], form: str = "", asked: Asked | None = No
     Raises:
         InputError: for files that are none of a known format, and what is wrong in them.
     """
+    asked = asked or Asked()
+    asked.check()
     require(given, "FILE", [], "a file or a folder")
     for path in given:
         require(path.exists(), "FILE", str(path), "a file or a folder that is there")
@@ -58,7 +67,7 @@ def import_model(given: Sequence[Path], form: str = "", asked: Asked | None = No
     single = not FORMATS[form].folder
     if single and (len(given) != 1 or given[0].is_dir()):
         raise InputError("FILE", [str(path) for path in given], f"one file of the format {form}")
-    return form, FORMATS[form].read(given, asked or Asked())
+    return form, FORMATS[form].read(given, asked)
 
 
 def recognised(given: Sequence[Path]) -> str:
@@ -116,10 +125,10 @@ def export_model(
         check_folder("--out", out)
     else:
         require(
-            out.suffix.lower() in known.suffixes,
+            out.suffix.lower() in known.targets,
             "--out",
             str(out),
-            f"a name that ends in {' or '.join(known.suffixes)}",
+            f"a name that ends in {' or '.join(known.targets)}",
         )
         check_target("--out", out)
     return known.write(model, out, asked or Asked())

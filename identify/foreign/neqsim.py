@@ -22,6 +22,7 @@ from identify.foreign.common import (
     Pairs,
     assemble,
     chosen,
+    csv_rows,
     first_entry_of,
     foreign_names,
     full_responses,
@@ -30,7 +31,7 @@ from identify.foreign.common import (
     shifted,
     units_of,
 )
-from jaxmpc.check import require
+from jaxmpc.check import is_number, require
 from jaxmpc.errors import InputError
 from jaxmpc.files import read_json, write_atomically
 from jaxmpc.model.step_response import StepResponseModel
@@ -88,16 +89,16 @@ def _read_json(path: Path) -> tuple[Pairs, float, Rows]:
     pairs = Pairs(_named(path, names[1], cvs), _named(path, names[0], mvs))
     for entry in (*cvs, *mvs):
         pairs.units[entry["name"]] = str(entry.get("unit", ""))
-        if "currentValue" in entry:
-            pairs.working_point[entry["name"]] = number(
-                entry["currentValue"], f"{path}: currentValue", "where it stands"
-            )
+        if is_number(entry.get("currentValue")):  # it may be NaN there
+            pairs.working_point[entry["name"]] = float(entry["currentValue"])
     if dvs:
         listed = ", ".join(_named(path, "dv", dvs))
         pairs.notes.append(f"no equal: disturbances {listed}, to which the file has no responses")
     settings = body.get("tuning", {}) if whole else body
     given = settings.get("sampleTime") if isinstance(settings, dict) else None
     dt = number(given, f"{path}: sampleTime", "the sampling interval [s]")
+    unit = settings.get("sampleTimeUnit", "seconds") if isinstance(settings, dict) else ""
+    require(unit == "seconds" and dt > 0, f"{path}: sampleTime", f"{given} {unit}", "more than 0 seconds")
     rows = _matrix(path, body, pairs) if whole else _listed(path, body, pairs)
     pairs.notes += [f"unknown: {key} ({path})" for key in body if key not in TOP]
     left = [
@@ -130,13 +131,14 @@ def _listed(path: Path, body: dict[str, Any], pairs: Pairs) -> Rows:
     for i, entry in enumerate(given):
         where = f"{path}: stepResponses[{i}]"
         require(isinstance(entry, dict), where, entry, "an object")
-        cv, of = (tags.get(entry.get(key), entry.get(key)) for key in ("cv", "mv"))
+        cv, of = (str(entry.get(key)) for key in ("cv", "mv"))
+        cv, of = tags.get(cv, cv), tags.get(of, of)
         for key, name, known in (("cv", cv, pairs.cvs), ("mv", of, pairs.mvs)):
             require(name in known, f"{where}.{key}", name, f"one of {', '.join(known)}")
         require((cv, of) not in rows, where, f"{of} on {cv}", "each pair once")
         rows[cv, of] = f"{where}.coefficients", _values(f"{where}.coefficients", entry.get("coefficients"))
-    constants = {entry.get("timeConstant") for entry in given}
-    if len(constants) == 1 and len(given) > 1 and None not in constants:
+    constants = {str(entry.get("timeConstant")) for entry in given}
+    if len(constants) == 1 and len(given) > 1 and "None" not in constants:
         (constant,) = constants
         pairs.notes.append(
             f"look: every response has the time constant {constant} s, the default of NeqSim's exporter, which need not be "
@@ -167,31 +169,30 @@ def _values(where: str, given: Any) -> np.ndarray:
 
 def _read_csv(path: Path, asked: Asked) -> tuple[Pairs, float, Rows]:
     """``Step,Time,CV/MV,...``: a row per sample, times in seconds."""
-    lines = [row for row in csv.reader(io.StringIO(read_text(path))) if row]
-    head = [cell.strip() for cell in lines[0]] if lines else []
+    rows = csv_rows(read_text(path), path)
+    head = rows[0][1] if rows else []
     kinds = [cell.lower() for cell in head]
     expected = "a head of Time and columns CV/MV, after Step if there is one"
     require("time" in kinds, f"{path}:1", ",".join(head), expected)
     time = kinds.index("time")
     columns = [k for k, name in enumerate(head) if "/" in name]
-    require(columns and len(lines) > 2, f"{path}:1", ",".join(head), f"{expected}, and two rows or more")
-    table = np.zeros((len(lines) - 1, len(head)))
-    for i, row in enumerate(lines[1:]):
-        where = f"{path}:{i + 2}"
+    require(columns and len(rows) > 2, f"{path}:1", ",".join(head), f"{expected}, and two rows or more")
+    table = np.zeros((len(rows) - 1, len(head)))
+    for i, (where, row) in enumerate(rows[1:]):
         require(len(row) == len(head), where, f"{len(row)} cells", f"{len(head)} cells, as the head has")
-        table[i] = [number(cell.strip(), where, head[k]) for k, cell in enumerate(row)]
+        table[i] = [number(cell, where, head[k]) for k, cell in enumerate(row)]
     steps = np.diff(table[:, time])
     even = (steps > 0).all() and np.ptp(steps) <= 1e-6 * steps.max()
     require(even, f"{path}: Time", steps[:3].tolist(), "times one sampling interval apart [s]")
-    rows: Rows = {}
+    out: Rows = {}
     for k in columns:
         cv, _, of = head[k].partition("/")
-        require(cv and of and (cv, of) not in rows, f"{path}:1", head[k], "CV/MV, each pair once")
-        rows[cv, of] = f"{path}: {head[k]}", table[:, k]
-    inputs = list(dict.fromkeys(of for _, of in rows))
+        require(cv and of and (cv, of) not in out, f"{path}:1", head[k], "CV/MV, each pair once")
+        out[cv, of] = f"{path}: {head[k]}", table[:, k]
+    inputs = list(dict.fromkeys(of for _, of in out))
     chosen("--dv", asked.dvs, inputs)
     mvs = [name for name in inputs if name not in asked.dvs]
-    pairs = Pairs(list(dict.fromkeys(cv for cv, _ in rows)), mvs, list(asked.dvs))
+    pairs = Pairs(list(dict.fromkeys(cv for cv, _ in out)), mvs, list(asked.dvs))
     pairs.notes += [
         f"unknown: column {head[k]} ({path})"
         for k in range(len(head))
@@ -204,7 +205,7 @@ def _read_csv(path: Path, asked: Asked) -> tuple[Pairs, float, Rows]:
             "time 0 in the first row",
             "Give --first-entry 1 where it is one sample",
         )
-    return pairs, float(np.median(steps)), rows
+    return pairs, float(np.median(steps)), out
 
 
 def write(model: StepResponseModel, path: Path, asked: Asked) -> tuple[list[Path], list[str]]:

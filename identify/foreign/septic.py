@@ -92,7 +92,20 @@ def _responses(own: Application, files: Sequence[Path], asked: Asked) -> Pairs:
     """Responses of the variables of an application, with units and the working point that the configuration has."""
     names = own.names
     told = dataclasses.replace(asked, **names)
-    pairs = mdf.read_models(files, told, names["cvs"], (*names["mvs"], *names["dvs"]))
+    inputs = (*names["mvs"], *names["dvs"])
+    elsewhere = {kind: [b.name for b in own.others if b.kind in kind] for kind in (("Cvr",), ("Mvr", "Dvr"))}
+    mine, left = [], []
+    for path in files:
+        try:
+            mdf.pair_of(path, names["cvs"], inputs)
+            mine.append(path)
+        except InputError:
+            if not all(elsewhere.values()):
+                raise
+            mdf.pair_of(path, *elsewhere.values())
+            left.append(path.name)
+    pairs = mdf.read_models(mine, told, names["cvs"], inputs)
+    pairs.notes += [f"not used, as models of another application: {', '.join(left)}"] if left else []
     for block in (*own.cvs, *own.mvs, *own.dvs):
         pairs.units[block.name] = block.word("Unit", "")
     for block in (*own.cvs, *own.mvs):

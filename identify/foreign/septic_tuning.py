@@ -71,11 +71,11 @@ def fill(
     body["presets"] = {"septic": preset}
 
 
-def _count(block: Block, name: str, default: int) -> int:
+def _count(block: Block, name: str, default: int, least: int = 1) -> int:
     value = block.number(name, "samples", default)
     found = block.find(name)
     where = block.place(found) if found else block.where
-    require(value == int(value) and value >= 1, where, value, f"a whole number of samples, 1 or more: {name}")
+    require(value == int(value) >= least, where, value, f"a whole number of samples, {least} or more: {name}")
     return int(value)
 
 
@@ -124,14 +124,13 @@ def _fitted(blocks: list[int], horizon: int) -> list[int]:
 
 def _first(own: Application, report: Report) -> dict[str, int]:
     """Samples that are not evaluated: one number for all CVs, the fewest."""
-    left = {b.name: int(b.number("EvalDT", "samples that are not evaluated", 0)) for b in own.cvs}
+    left = {b.name: _count(b, "EvalDT", 0, least=0) for b in own.cvs}
     first = min(left.values())
     for block in own.cvs:
         if left[block.name] != first:
             report.say(
                 block, "EvalDT", "approximated", f"{first}, as of another CV: one first_penalised for all"
             )
-    require(first >= 0, own.head.where, first, "EvalDT of 0 or more samples")
     return {"first_penalised": first + 1} if first else {}
 
 
@@ -240,17 +239,9 @@ def _measurements(preset: dict[str, Any], own: Application, ours: Mapping[str, s
                 )
             elif abs(value) < NO_LIMIT:
                 preset.setdefault(f"measurement_{side.lower()}", {})[name] = value
-        limit = block.number("BadCntLim", "bad measurements in a row", 0)
+        limit = _count(block, "BadCntLim", 0, least=0)
         if limit:
-            found = block.find("BadCntLim")
-            good = limit == int(limit) and limit >= 1
-            require(
-                good,
-                block.place(found) if found else block.where,
-                limit,
-                "a whole number of samples, 0 for never",
-            )
-            preset.setdefault("bad_limit", {})[name] = int(limit)
+            preset.setdefault("bad_limit", {})[name] = limit
         else:
             report.say(block, "BadCntLim", "equal", "never switched off")
 

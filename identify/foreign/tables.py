@@ -5,8 +5,6 @@ In TOML the list is that of a process file, ``transfer_functions``, with ``dt`` 
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import tomllib
 from collections.abc import Sequence
@@ -24,6 +22,7 @@ from identify.foreign.common import (
     Pairs,
     assemble,
     chosen,
+    csv_rows,
     number,
     read_text,
 )
@@ -65,7 +64,8 @@ MOST = 5000  # coefficients that are made without being asked for
 
 def recognises(text: str) -> bool:
     """Whether the text of a CSV file is such a table."""
-    found = set(map(_column, _cells(text.lstrip().split("\n", 1)[0], _separator(text))))
+    head = next((line for line in text.splitlines() if line.strip()), "")
+    found = {_column(cell.strip(' "')) for cell in head.split(_separator(text))}
     return {"cv", "gain"} <= found and bool(found & {"mv", "dv"})
 
 
@@ -127,10 +127,6 @@ def _separator(text: str) -> str:
     return next((mark for mark in (";", "\t") if mark in head), ",")
 
 
-def _cells(line: str, separator: str) -> list[str]:
-    return [cell.strip() for cell in next(csv.reader([line.strip("\r\n")], delimiter=separator), [])]
-
-
 def _plain(head: str) -> str:
     plain = "".join(c for c in head.lower() if c.isalnum())
     return plain[:-1] if plain.endswith("1") else plain
@@ -145,32 +141,28 @@ def _read_csv(
 ) -> tuple[list[TransferFunctionSection], list[str], dict[str, str], None, None]:
     text = read_text(path)
     separator = _separator(text)
-    rows = csv.reader(io.StringIO(text), delimiter=separator)
-    head: list[str] = []
-    sections, notes, units, left = [], [], dict[str, str](), set[str]()
-    for row in rows:
-        where, cells = f"{path}:{rows.line_num}", [cell.strip() for cell in row]
-        if not any(cells) or cells[0].startswith("#"):
-            continue
-        if not head:
-            head = [_column(cell) for cell in cells]
-            require(
-                {"cv", "gain"} <= set(head), where, text.split("\n", 1)[0].strip(), "columns cv, mv and gain"
-            )
-            twice = sorted({name for name in head if name and head.count(name) > 1})
-            require(not twice, where, twice, "each column once")
-            left |= {cell for cell, name in zip(cells, head, strict=True) if not name}
-            continue
+    rows = csv_rows(text, path, separator)
+    require(
+        len(rows) > 1, str(path), "no rows", "a table with columns cv, mv, gain, dead_time, time_constant"
+    )
+    (where, told), units = rows[0], dict[str, str]()
+    head = [_column(cell) for cell in told]
+    require({"cv", "gain"} <= set(head), where, ",".join(told), "columns cv, mv and gain")
+    twice = sorted({name for name in head if name and head.count(name) > 1})
+    require(not twice, where, twice, "each column once")
+    sections = []
+    for where, cells in rows[1:]:
         require(len(cells) == len(head), where, f"{len(cells)} cells", f"{len(head)} cells, as the head has")
         given = {name: cell for name, cell in zip(head, cells, strict=True) if name and cell}
         section = _section(where, given, separator == ";", asked)
         sections.append(section)
-        units |= {section.cv: given["cv_unit"]} if "cv_unit" in given else {}
-        units |= {section.mv or section.dv: given["input_unit"]} if "input_unit" in given else {}
-    require(sections, str(path), "no rows", "a table with columns cv, mv, gain, dead_time, time_constant")
+        for column, name in (("cv_unit", section.cv), ("input_unit", section.mv or section.dv)):
+            units |= {name: given[column]} if column in given else {}
     chosen("--dv", asked.dvs, [section.dv for section in sections if section.dv])
     said = lambda name: "not used" if _plain(name) in UNUSED else "unknown"  # noqa: E731
-    notes += [f"{said(name)}: column {name} ({path})" for name in sorted(left)]
+    notes = [
+        f"{said(cell)}: column {cell} ({path})" for cell, name in zip(told, head, strict=True) if not name
+    ]
     return sections, notes, units, None, None
 
 
@@ -206,7 +198,7 @@ def _read_toml(
 ) -> tuple[list[TransferFunctionSection], list[str], dict[str, str], Any, Any]:
     try:
         body = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError("file", str(path), f"a TOML file ({error})") from None
     with located(lambda field: f"{path}: {field}"):
         file = decode(body, TableFile, name="table")
