@@ -127,7 +127,7 @@ def _listed(path: Path, body: dict[str, Any], pairs: Pairs) -> Rows:
     require(isinstance(given, list) and given, f"{path}: stepResponses", given, "a list of responses")
     tags = {}
     for key in ("controlledVariables", "manipulatedVariables"):
-        tags |= {entry.get("tag", entry["name"]): entry["name"] for entry in body.get(key, [])}
+        tags |= {str(entry.get("tag", entry["name"])): entry["name"] for entry in body.get(key, [])}
     for i, entry in enumerate(given):
         where = f"{path}: stepResponses[{i}]"
         require(isinstance(entry, dict), where, entry, "an object")

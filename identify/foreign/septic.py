@@ -267,9 +267,13 @@ def _describe(entry: dict[str, Any], block: Block) -> None:
 
 
 def _move(entry: dict[str, Any], block: Block, switch: bool, report: Report) -> None:
-    """The largest move per sample; other ones up and down stand in the preset."""
+    """The largest move per sample, and where the actuator stands; other moves up and down stand in the preset."""
     up, down = septic_tuning.moves_of(block)
     entry.pop("move", None)
+    if block.number("ProcessValue", "where the actuator stands", math.nan) == block.number(
+        "Meas", "the demand", 0.0
+    ):
+        report.say(block, "ProcessValue", "equal", "working point")
     if switch:
         for name in ("MaxUp", "MaxDn"):
             report.say(block, name, "none", "on or off: a move is the whole range")

@@ -50,10 +50,13 @@ def _all(names: str, level: Level, says: str, *neutral: str) -> dict[str, Meanin
     return dict.fromkeys(names.split(), Meaning(level, says, neutral))
 
 
+STATION_SAYS = "display and operator station"
+PROGRAM_SAYS = "the program around the controller: buffers, windows, users"
+SOLVERS_SAYS = "its solvers; ours decide by themselves"
 STATION = _all(
     "Auto PlotMax PlotMin PlotSpan Nfix MaxChg GrpMask GrpType LockHL LockSP LockLL LockIV",
     "none",
-    "display and operator station",
+    STATION_SAYS,
 )
 VARIABLE = {
     "Text1": Meaning("equal", "label"),
@@ -74,7 +77,7 @@ MEANINGS: Mapping[str, Mapping[str, Meaning]] = {
             "InitHeight MinimizeByHide HideCloseButton OPCSampleTimeOffset Nxupd ClipOn WdwDx WdwDy Xline Xback Xgroup "
             "Zname Zhilo Zstate Zopen Zfont Zline StepInterval AutoRun ShowUpdateCounter",
             "none",
-            "the program around the controller: buffers, windows, users",
+            PROGRAM_SAYS,
         ),
     },
     "Appl": {
@@ -94,7 +97,7 @@ MEANINGS: Mapping[str, Mapping[str, Meaning]] = {
             "FuncPrec FeTol OptimTol FdifIntv MaxSeconds LmPrio MaxPrioSQP UnConstrnd OpenFlag UpdFilt RelPert FeasTol "
             "EachParam LinErrorLim ColdStart PrintSens SensLimSS SensLimDyn MasterOn SimOptimal PlotMax",
             "none",
-            "its solvers; ours decide by themselves",
+            SOLVERS_SAYS,
         ),
     },
     "Mvr": {
@@ -192,6 +195,10 @@ OTHER = {  # blocks that no controller is made of, by how their types begin
 }
 
 
+# what is counted on the terminal, and listed in the file only
+BESIDE = {*OTHER, STATION_SAYS, PROGRAM_SAYS, SOLVERS_SAYS, "a remark"}
+
+
 def meanings_of(block: Block) -> Mapping[str, Meaning] | None:
     """The table for a block of a controller; None for any other."""
     return MEANINGS.get("Appl" if block.kind in APPLICATIONS else block.kind)
@@ -266,16 +273,26 @@ class Report:
         return "\n".join(out)
 
     def summary(self) -> list[str]:
-        """How many there are of each level, and what is unknown by name."""
-        count = {
-            level: sum(max(len(r.attributes), 1) for r in self.rows if r.level == level) for level in HEADINGS
-        }
-        out = [f"{heading}: {count[level]}" for level, heading in HEADINGS.items()]
-        return out + [
-            f"  {row.subject}: {', '.join(row.attributes)} ({row.place})"
-            for row in self.rows
-            if row.level == "unknown"
-        ]
+        """For the terminal: how many there are of each level, and what is lost, those alike in one line."""
+        out = []
+        for level, heading in HEADINGS.items():
+            rows = [row for row in self.rows if row.level == level]
+            out.append(f"{heading}: {sum(max(len(row.attributes), 1) for row in rows)}")
+            groups: dict[tuple[str, str], list[str]] = {}
+            for row in rows if level != "equal" else ():
+                named = level == "unknown" or row.says not in BESIDE
+                subject = (
+                    f"{row.subject} ({row.place})" if level == "unknown" else row.subject.partition(" ")[0]
+                )
+                groups.setdefault((subject if named else "", row.says), []).extend(row.attributes)
+            beside = sum(len(names) for (subject, _), names in groups.items() if not subject)
+            out += [
+                f"  {subject} {', '.join(dict.fromkeys(names))}: {says}"
+                for (subject, says), names in groups.items()
+                if subject
+            ]
+            out += [f"  {beside} of displays, stations, solvers and other blocks"] if beside else []
+        return out
 
 
 def _found(table: Mapping[str, Meaning], attribute: Attribute) -> tuple[Level, str]:

@@ -239,6 +239,10 @@ def _measurements(preset: dict[str, Any], own: Application, ours: Mapping[str, s
                 )
             elif abs(value) < NO_LIMIT:
                 preset.setdefault(f"measurement_{side.lower()}", {})[name] = value
+        low, high = (preset.get(f"measurement_{side}", {}).get(name) for side in ("low", "high"))
+        found = block.find("MeasLowLimit")
+        if found and low is not None and high is not None:
+            require(low <= high, block.place(found), low, f"at most MeasHighLimit = {high:g}")
         limit = _count(block, "BadCntLim", 0, least=0)
         if limit:
             preset.setdefault("bad_limit", {})[name] = limit
