@@ -141,8 +141,8 @@ def read_application(given: Path, model_file: str, name: str, asked: Asked, choi
     own = application_of(configuration, choices.application)
     report = Report()
     pairs = _responses(own, files, asked)
-    limits = {block.name: _limits(block, report) for block in own.mvs}
-    _start_inside(pairs, limits, report)
+    limits = {block.name: _limits(block, report) for block in (*own.mvs, *own.cvs)}
+    _start_inside(pairs, {mv: limits[mv] for mv in own.names["mvs"]}, report)
     model, notes = assemble(pairs, _timed(own, asked), "SEPTIC")
     report.notes += notes
     if own.system is None or own.system.find("Nsecs") is None:
@@ -225,26 +225,20 @@ def _body(
         name,
         steps={named(mv): step for mv, step in choices.steps.items()},
         switches=[named(mv) for mv in choices.switches],
-        limits={ours[mv]: pair for mv, pair in limits.items() if all(map(math.isfinite, pair))},
+        limits={ours[mv]: limits[mv] for mv in own.names["mvs"] if all(map(math.isfinite, limits[mv]))},
     )
     body = tomllib.loads(text)
-    body = {"name": body["name"], "title": own.head.word("Text1", "") or body["name"], **body}
+    title = own.head.word("Text1", "")
+    body = {"name": body["name"], **({"title": title} if title else {}), **body}
     body["source"] = (
         f"SEPTIC configuration {own.head.file.rpartition('/')[2]}, {own.head.kind} {own.head.name}"
     )
-    if not own.head.word("Text1", ""):
-        body.pop("title")
     for kind, blocks in (("cv", own.cvs), ("mv", own.mvs), ("disturbance", own.dvs)):
-        for entry, block in zip(body.get(kind, []), blocks, strict=False):
+        for entry, block in zip(
+            body.get(kind, []), blocks, strict=False
+        ):  # loads follow the measured disturbances
             _describe(entry, block)
-            pair = (
-                limits[block.name]
-                if kind == "mv"
-                else _limits(block, report)
-                if kind == "cv"
-                else (math.nan, math.nan)
-            )
-            for key, value in zip(("low", "high"), pair, strict=True):
+            for key, value in zip(("low", "high"), limits.get(block.name, ()), strict=False):
                 entry.pop(key, None)
                 entry |= {key: value} if math.isfinite(value) else {}
             if kind == "mv":

@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 
 from identify.foreign.common import (
+    LONGEST,
     TIME_UNITS,
     Asked,
     Curve,
@@ -38,7 +39,7 @@ class TableFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     transfer_functions: tuple[TransferFunctionSection, ...]
     dt: Annotated[float, msgspec.Meta(gt=0)] | None = None  # [s]
-    samples: Annotated[int, msgspec.Meta(ge=1)] | None = None
+    samples: Annotated[int, msgspec.Meta(ge=1, le=LONGEST)] | None = None
     units: dict[str, str] = {}  # by name
 
 

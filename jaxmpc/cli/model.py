@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, choice, command, option
+from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, command, option
 from jaxmpc.files import check_target
 
 FIRST_ENTRY = option(
@@ -15,8 +15,14 @@ FIRST_ENTRY = option(
     int,
     choices=(0, 1),
 )
-WHICH = choice("--which", ("A", "B"), "response of SEPTIC model files")
-TIME_UNIT = choice("--time-unit", ("s", "min", "h"), "of dead times and time constants in the files")
+WHICH = option("--which", "A|B", "response of SEPTIC model files (default: A)", str, choices=("A", "B"))
+TIME_UNIT = option(
+    "--time-unit",
+    "s|min|h",
+    "of dead times and time constants in the files (default: s)",
+    str,
+    choices=("s", "min", "h"),
+)
 
 
 def asked_in(options: Options) -> Any:

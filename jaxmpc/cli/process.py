@@ -9,8 +9,12 @@ from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, choice, command, na
 from jaxmpc.errors import InputError
 from jaxmpc.files import check_folder, check_target
 
-WEIGHTS = choice(
-    "--weights", ("span", "plain"), "whether SEPTIC's penalties are of variables scaled by their spans"
+WEIGHTS = option(
+    "--weights",
+    "span|plain",
+    "whether SEPTIC's penalties are of variables scaled by their spans, or plain (default: span)",
+    str,
+    choices=("span", "plain"),
 )
 
 
@@ -41,8 +45,9 @@ def new(options: Options) -> int:
         )
     if options.septic:
         return _new_from_septic(options)
-    if options.application:
-        raise InputError("--application", options.application, "nothing: it is of --septic")
+    for key in ("application", "weights", "first_entry", "which", "time_unit"):
+        if (value := getattr(options, key)) not in (None, ""):
+            raise InputError(f"--{key.replace('_', '-')}", value, "nothing: it is of --septic")
     from jaxmpc.files import write_atomically
     from jaxmpc.model.step_response import StepResponseModel
     from jaxmpc.process.file import load_process
@@ -84,7 +89,7 @@ def _new_from_septic(options: Options) -> int:
         if target.exists():
             raise InputError("--out", str(target), "a file that does not exist yet: yours is not overwritten")
     steps = dict(named_number("--step", text) for text in options.step or ())
-    choices = Choices(options.application, options.weights, steps, tuple(options.on_off or ()))
+    choices = Choices(options.application, options.weights or "span", steps, tuple(options.on_off or ()))
     made = read_application(options.septic, model_file.name, _named(out.stem), asked_in(options), choices)
     process_of(made.body, out.parent, files=False)  # what it refuses is refused before anything is written
     made.model.save(model_file)
@@ -120,7 +125,7 @@ def export(options: Options) -> int:
     process = load_process(options.process)
     process.tuning_fields(options.preset or None)
     files, report = export_process(
-        process, model_of(process), options.out, options.preset, options.weights, asked_in(options)
+        process, model_of(process), options.out, options.preset, options.weights or "span", asked_in(options)
     )
     print(*files, sep="\n")
     print(*report.summary(), *report.notes, sep="\n  ")

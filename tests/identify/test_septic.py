@@ -198,6 +198,8 @@ def test_the_command_writes_process_model_and_report_which_the_check_accepts(tmp
         if "cannot be held" in f.says and "setpoints" not in f.subject
     ]
     assert main(["process", "new", "--septic", str(folder), "--out", str(out)]) == 2, "nothing is overwritten"
+    assert main(["process", "new", "--model", str(tmp_path / "mine.json"), "--weights", "plain"]) == 2
+    assert "--weights: got 'plain', expected nothing: it is of --septic" in capsys.readouterr().err
     assert main(["process", "export", str(out), "--to", "septic", "--out", str(tmp_path / "back")]) == 0
     assert (tmp_path / "back" / "mine.cnfg").is_file()
 
