@@ -1,6 +1,6 @@
 """Files that are written, the one place where that happens: a regular file is replaced in one go or not at all, a link
 is followed, a pipe or a character device is written to. `check_target` refuses beforehand what could not be written.
-`strict_json` is how numbers that JSON has no word for stand in them.
+`strict_json` is how numbers that JSON has no word for stand in them, `toml_text` how a table becomes a TOML file.
 """
 
 from __future__ import annotations
@@ -56,6 +56,61 @@ def json_by_field(body: dict[str, Any], **options: Any) -> str:
     """The text of a JSON object with a line per field; options of `json.dumps`."""
     fields = (f" {json.dumps(key)}: {json.dumps(value, **options)}" for key, value in body.items())
     return "{\n" + ",\n".join(fields) + "\n}\n"
+
+
+def toml_text(body: Mapping[str, Any]) -> str:
+    """The text of a TOML file: values first, then a header per table, list of tables and table of tables."""
+    heads: list[str] = []
+    values = {}
+    for name, value in body.items():
+        if isinstance(value, Mapping) and value and all(isinstance(one, Mapping) for one in value.values()):
+            heads += [
+                _headed(f"[{_toml_key(name)}.{_toml_key(inner)}]", table) for inner, table in value.items()
+            ]
+        elif isinstance(value, Mapping):
+            heads += [_headed(f"[{_toml_key(name)}]", value)]
+        elif isinstance(value, (list, tuple)) and value and all(isinstance(one, Mapping) for one in value):
+            heads += [_headed(f"[[{_toml_key(name)}]]", table) for table in value]
+        else:
+            values[name] = value
+    return "\n\n".join(["\n".join(toml_keys(values)), *heads]).strip() + "\n"
+
+
+def _headed(head: str, table: Mapping[str, Any]) -> str:
+    return "\n".join([head, *(f"{_toml_key(name)} = {toml_value(value)}" for name, value in table.items())])
+
+
+def toml_keys(table: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """A table as lines of TOML with dotted keys; lists of tables are written within their line."""
+    lines = []
+    for name, value in table.items():
+        key = prefix + _toml_key(name)
+        lines += (
+            toml_keys(value, f"{key}.") if isinstance(value, Mapping) else [f"{key} = {toml_value(value)}"]
+        )
+    return lines
+
+
+def toml_value(value: Any) -> str:
+    """A value within its line; numbers in as many digits as bring them back."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return "nan" if math.isnan(value) else repr(float(value))
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(toml_value, value))}]"
+    if isinstance(value, Mapping):
+        return f"{{ {', '.join(f'{_toml_key(k)} = {toml_value(v)}' for k, v in value.items())} }}"
+    return (
+        json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+        if isinstance(value, str)
+        else str(value)
+    )
+
+
+def _toml_key(name: str) -> str:
+    bare = name.replace("_", "").replace("-", "").isalnum() and name.isascii()
+    return name if bare else json.dumps(name, ensure_ascii=False)
 
 
 def read_named_toml(

@@ -4,21 +4,50 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, command, named_number, option
+from jaxmpc.cli.model import FIRST_ENTRY, TIME_UNIT, WHICH, asked_in
+from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, choice, command, named_number, option
 from jaxmpc.errors import InputError
 from jaxmpc.files import check_folder, check_target
+
+WEIGHTS = option(
+    "--weights",
+    "span|plain",
+    "whether SEPTIC's penalties are of variables scaled by their spans, or plain (default: span)",
+    str,
+    choices=("span", "plain"),
+)
 
 
 @command(
     "process new",
-    option("--model", "MODEL.json", "step-response model of the process", Path, required=True),
+    option("--model", "MODEL.json", "step-response model of the process", Path),
+    option(
+        "--septic",
+        "DIR",
+        "SEPTIC application in place of a model: a .cnfg and its .mdf files, or the .cnfg",
+        Path,
+    ),
     option("--out", "FILE.toml", "where to write (default: the model's name with .toml, beside it)", Path),
     option("--step", "MV=SIZE", "an MV that moves in steps of this size [MV unit]", str, action="append"),
     option("--on-off", "MV", "an MV that is on or off", str, action="append"),
-    epilog=f"The file that it writes says what was guessed. {EXITS}",
+    option("--application", "NAME", "of SEPTIC: which application of several", ""),
+    WEIGHTS,
+    FIRST_ENTRY,
+    WHICH,
+    TIME_UNIT,
+    epilog=f"The file that it writes says what was guessed; of SEPTIC a report beside it says what has no equal. {EXITS}",
 )
 def new(options: Options) -> int:
-    """Write a first process file from a model, and say what was guessed."""
+    """Write a first process file from a model or a SEPTIC application, and say what was guessed."""
+    if bool(options.model) == bool(options.septic):
+        raise InputError(
+            "--model", options.model and str(options.model), "a model, or with --septic an application"
+        )
+    if options.septic:
+        return _new_from_septic(options)
+    for key in ("application", "weights", "first_entry", "which", "time_unit"):
+        if (value := getattr(options, key)) not in (None, ""):
+            raise InputError(f"--{key.replace('_', '-')}", value, "nothing: it is of --septic")
     from jaxmpc.files import write_atomically
     from jaxmpc.model.step_response import StepResponseModel
     from jaxmpc.process.file import load_process
@@ -43,6 +72,63 @@ def new(options: Options) -> int:
     print(out)
     print("Guessed, so look at it first:", *guesses, sep="\n  ")
     print(f"Next: jaxmpc process check {out}, then jaxmpc study run comparison --process {out}")
+    return EXIT_OPTIMAL
+
+
+def _new_from_septic(options: Options) -> int:
+    """Write process file, model and report of a SEPTIC application."""
+    from identify.foreign.septic import Choices, read_application
+    from jaxmpc.files import toml_text, write_atomically
+    from jaxmpc.process.file import load_process, process_of
+
+    folder = options.septic if options.septic.is_dir() else options.septic.parent
+    out: Path = options.out or folder / f"{_named(options.septic.resolve().stem)}.toml"
+    model_file, page = out.with_suffix(".json"), out.with_name(f"{out.stem}-septic.md")
+    for target in (out, model_file, page):
+        check_target("--out", target)
+        if target.exists():
+            raise InputError("--out", str(target), "a file that does not exist yet: yours is not overwritten")
+    steps = dict(named_number("--step", text) for text in options.step or ())
+    choices = Choices(options.application, options.weights or "span", steps, tuple(options.on_off or ()))
+    made = read_application(options.septic, model_file.name, _named(out.stem), asked_in(options), choices)
+    process_of(made.body, out.parent, files=False)  # what it refuses is refused before anything is written
+    made.model.save(model_file)
+    write_atomically(page, made.report.text(f"{out.stem}: what became of the SEPTIC application"))
+    write_atomically(out, toml_text(made.body))
+    load_process(out)
+    print(out, model_file, page, sep="\n")
+    print(*made.report.summary(), *made.report.notes, sep="\n  ")
+    print(f"Next: jaxmpc process check {out}, then jaxmpc study run comparison --process {out}")
+    return EXIT_OPTIMAL
+
+
+@command(
+    "process export",
+    option("process", "PROCESS", "a process file, or the name of a shipped process", str),
+    choice("--to", ("septic",), "format"),
+    option("--out", "DIR", "folder to write", Path, required=True),
+    option("--preset", "NAME", "tuning (default: the first)", ""),
+    WEIGHTS,
+    FIRST_ENTRY,
+    TIME_UNIT,
+    epilog=f"A report in the folder says what the format cannot say. {EXITS}",
+)
+def export(options: Options) -> int:
+    """Write tuning and model of a process as a SEPTIC application, and say what is lost."""
+    if options.out.is_file():
+        raise InputError("--out", str(options.out), "a folder")
+    check_folder("--out", options.out)
+    from identify.foreign.septic_out import export_process
+    from identify.plants import model_of
+    from jaxmpc.process.file import load_process
+
+    process = load_process(options.process)
+    process.tuning_fields(options.preset or None)
+    files, report = export_process(
+        process, model_of(process), options.out, options.preset, options.weights or "span", asked_in(options)
+    )
+    print(*files, sep="\n")
+    print(*report.summary(), *report.notes, sep="\n  ")
     return EXIT_OPTIMAL
 
 

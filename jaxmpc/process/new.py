@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from jaxmpc.errors import InputError, near
+from jaxmpc.files import toml_value
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.file import VARIABLE
 from jaxmpc.process.process import amount
@@ -28,6 +29,7 @@ def new_process(
     *,
     steps: Mapping[str, float] | None = None,
     switches: Sequence[str] = (),
+    limits: Mapping[str, tuple[float, float]] | None = None,
 ) -> tuple[str, list[str]]:
     """The text of a process file for a model, and what was guessed for it.
 
@@ -37,6 +39,7 @@ def new_process(
         name: of the process.
         steps: sizes of the steps of MVs that do not take every value [MV unit].
         switches: MVs that are on or off.
+        limits: low and high of MVs, where they are known [MV unit].
 
     Returns:
         ``(text, guesses)``.
@@ -49,7 +52,7 @@ def new_process(
     point = dict(model.working_point)
     cv_units, mv_units = (units or ("1",) * len(names) for units, names in _names(model))
     ranges = {
-        mv: _range(unit, point.get(mv), mv in switches)
+        mv: (limits or {}).get(mv) or _range(unit, point.get(mv), mv in switches)
         for mv, unit in zip(model.mv_names, mv_units, strict=True)
     }
     spans = np.array([(high - low) / (1 if mv in switches else 4) for mv, (low, high) in ranges.items()])
@@ -109,7 +112,7 @@ def new_process(
         lines += ["[[disturbance]] # not measured: added to the CV"]
         lines += [
             f'name = "output.{cv}"',
-            f"unit = {_text(unit)}",
+            f"unit = {toml_value(unit)}",
             f'label = "load on {cv.replace("_", " ")}"',
         ]
         lines += [f"span = {_round(span / 5):g}", ""]
@@ -148,10 +151,6 @@ def _check(model: StepResponseModel, steps: Mapping[str, float], switches: Seque
 
 def _names(model: StepResponseModel) -> tuple[tuple[tuple[str, ...], tuple[str, ...]], ...]:
     return (model.cv_units, model.cv_names), (model.mv_units, model.mv_names)
-
-
-def _text(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
 def _round(value: float, digits: int = 2) -> float:
@@ -213,11 +212,11 @@ def _head(model: StepResponseModel, file: str, name: str) -> list[str]:
         "# A process for studies of MPC with discrete actuators. What is guessed says so: look at it first.",
         "# `jaxmpc process check` judges this file and draws the responses.",
         "",
-        f"name = {_text(name)}",
+        f"name = {toml_value(name)}",
         f"dt = {model.dt:g} # s, that of the model",
         "",
         "[model]",
-        f"file = {_text(file)}",
+        f"file = {toml_value(file)}",
         "",
         "[plants.model] # the model is its own plant; studies may vary gains, dead times and time scales of it",
         'kind = "model"',
@@ -226,11 +225,11 @@ def _head(model: StepResponseModel, file: str, name: str) -> list[str]:
 
 
 def _variable(name: str, unit: str, span: float, why: str) -> list[str]:
-    return [f"name = {_text(name)}", f"unit = {_text(unit)}", f"span = {span:g} # {why}"]
+    return [f"name = {toml_value(name)}", f"unit = {toml_value(unit)}", f"span = {span:g} # {why}"]
 
 
 def _table(names: Sequence[str], values: Sequence[float]) -> str:
-    return "{ " + ", ".join(f"{_text(n)} = {v:g}" for n, v in zip(names, values, strict=True)) + " }"
+    return toml_value({name: float(value) for name, value in zip(names, values, strict=True)})
 
 
 def _tuning(

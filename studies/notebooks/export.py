@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import math
 import string
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,6 +13,7 @@ import numpy as np
 from figures import explore as draw
 from figures import style
 from jaxmpc import html
+from jaxmpc.files import toml_keys
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS as TUNING
 from studies.definition.fields import as_text
@@ -27,7 +26,7 @@ TEMPLATE = Path(__file__).with_name("page.html")
 def as_toml(done: ExploreRun, name: str = "explored") -> str:
     """A run as a study file without axes: `jaxmpc study run` repeats it, and an axis makes a sweep of it."""
     body = done.definition.body
-    lines = ["[study]", *_keys(body["study"] | {"name": name}), "", "[base]", *_keys(body["base"])]
+    lines = ["[study]", *toml_keys(body["study"] | {"name": name}), "", "[base]", *toml_keys(body["base"])]
     return "\n".join(lines) + "\n"
 
 
@@ -131,29 +130,6 @@ def _named(runs: Mapping[str, ExploreRun], colours: Sequence[str]) -> list[html.
         html.Markup(f'<b style="color:{colour}">{html.escape(name)}</b>')
         for name, colour in zip(runs, colours, strict=True)
     ]
-
-
-def _keys(table: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """A table as lines of TOML with dotted keys; lists of tables are written within their line."""
-    lines = []
-    for name, value in table.items():
-        key = prefix + (
-            name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else json.dumps(name)
-        )
-        lines += _keys(value, f"{key}.") if isinstance(value, Mapping) else [f"{key} = {_value(value)}"]
-    return lines
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, float):
-        return "nan" if math.isnan(value) else repr(value)
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(map(_value, value))}]"
-    if isinstance(value, Mapping):
-        return f"{{ {', '.join(_keys(value))} }}"
-    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else str(value)
 
 
 def cell_text(value: Any) -> str:

@@ -7,13 +7,21 @@ import os
 import socket
 import stat
 import threading
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from jaxmpc.errors import InputError
-from jaxmpc.files import check_folder, check_target, from_strict_json, strict_json, write_atomically
+from jaxmpc.files import (
+    check_folder,
+    check_target,
+    from_strict_json,
+    strict_json,
+    toml_text,
+    write_atomically,
+)
 
 posix = pytest.mark.skipif(os.name != "posix", reason="modes, links and pipes of POSIX")
 pytestmark = posix
@@ -291,3 +299,17 @@ def test_an_array_becomes_lists_that_are_read_back_to_the_last_bit():
     array = np.array([[0.1, np.nan], [np.inf, 1 / 3]])
     again = from_strict_json(json.loads(json.dumps(strict_json(array), allow_nan=False)))
     np.testing.assert_array_equal(np.array(again), array)
+
+
+def test_a_table_that_is_written_as_toml_reads_back_the_same():
+    body = {
+        "name": 'a "quoted" \\ name\n\x7f\x01é',
+        "numbers": [1, 2.5, 1e-300, -math.inf, 0.1 + 0.2, 1e22],
+        "flags": [True, False],
+        "empty": {},
+        "none": [],
+        "model": {"point": {"a.b": 1.0, "ü": {"deep": [[1, 2], [3]]}}, "list": [{"x": 1}, {"y": {"z": "t"}}]},
+        "presets": {"first": {"weight": {"a": 1.0}}, "odd name": {}},
+        "cv": [{"name": "a", "span": 2.0, "actuator": {"kind": "stepped", "step": 0.5}}, {"name": "b"}],
+    }
+    assert tomllib.loads(toml_text(body)) == body

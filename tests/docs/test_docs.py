@@ -31,11 +31,12 @@ DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
 NOTEBOOK = ROOT / "studies" / "notebooks" / "tour.ipynb"
 FENCE = re.compile(r"^```(\w+)[ \t]*([^\n]*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-FILE = re.compile(r"([\w.-]+\.(?:toml|json|py))(, changed)?")
+FILE = re.compile(r"([\w.-]+\.(?:toml|json|py|csv|cnfg|mdf))(, changed)?")
 QUICK = {
     "reading-a-plan.md",
     "mathematics.md",
     "processes.md",
+    "other-tools.md",
 }  # the other pages with Python take more than 20 s
 COMPILER = "Needs a C compiler"
 
@@ -149,7 +150,7 @@ def command(words: list[str]) -> tuple[argparse.ArgumentParser, list[str]]:
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_commands_of_a_page_exist_with_their_options(page):
     for words in re.findall(
-        r"\bjaxmpc ((?:plan|fmu|identify|process|study|simulate|figures|explore|bench)\b[^`\n]*)",
+        r"\bjaxmpc ((?:plan|fmu|identify|model|process|study|simulate|figures|explore|bench)\b[^`\n]*)",
         page.read_text(),
     ):
         words = re.split(r"\s+#|\s{2,}|[;|&]", words)[0].replace("'", "")

@@ -7,6 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from identify.foreign.septic_meaning import MEANINGS
 from jaxmpc.problem.declared import declared
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
@@ -62,7 +63,23 @@ def keys_of_studies() -> str:
     return table(["key", "unit", "default", "meaning"], rows)
 
 
+def meanings(*kinds) -> str:
+    """What becomes of the attributes of SEPTIC objects, those alike in one row."""
+    rows: dict[tuple[str, ...], list[str]] = {}
+    for kind in kinds:
+        for name, meaning in MEANINGS[kind].items():
+            level = {"none": "no equal"}.get(meaning.level, meaning.level)
+            key = level, meaning.says, ", ".join(value or '""' for value in meaning.neutral if value != '""')
+            rows.setdefault(key, []).append(f"`{name}`")
+    head = ["attribute", "is", "here", "asks for nothing at"]
+    return table(head, [[", ".join(dict.fromkeys(names)), *key] for key, names in rows.items()])
+
+
 TABLES = {
+    ("other-tools.md", "### System and application"): lambda: meanings("System", "Appl"),
+    ("other-tools.md", "### Manipulated variables"): lambda: meanings("Mvr"),
+    ("other-tools.md", "### Controlled variables"): lambda: meanings("Cvr"),
+    ("other-tools.md", "### Measured disturbances"): lambda: meanings("Dvr"),
     ("api/models.md", "## Fields of a structure"): lambda: fields_of(Structure),
     ("api/models.md", "## Fields of a tuning"): lambda: fields_of(Tuning),
     ("studies.md", "### `[base.tuning]`: changes of the preset"): keys_of_studies,
