@@ -144,12 +144,15 @@ MEANINGS: Mapping[str, Mapping[str, Meaning]] = {
         "FulfReScale": Meaning("none", "the weight is the same towards and away from the setpoint", ("1",)),
         "FulfUniScale": Meaning("none", "the weight is the same towards and away from the setpoint", ("1",)),
         "FulfDynScale": Meaning("approximated", "factor on cv_weight", ("1",)),
-        **_all(
-            "SetPntChangeMode SetPntRocUp SetPntRocDn",
-            "none",
-            "setpoints step; rows of a reference can make ramps",
+        "SetPntChangeMode": Meaning(
+            "approximated", "which of setpoint_filter and setpoint_rate a study sets"
         ),
-        "SetpTref": Meaning("none", "setpoints are not filtered", ("0",)),
+        **_all(
+            "SetPntRocUp SetPntRocDn",
+            "approximated",
+            "a setting of studies: setpoint_rate, the same both ways",
+        ),
+        "SetpTref": Meaning("approximated", "a setting of studies: setpoint_filter, one for all CVs", ("0",)),
         "SetPntFilt": Meaning("none", "setpoints are not filtered"),
         "BiasTfilt": Meaning("approximated", "bias_cutoff = 1 / time constant, one for all CVs"),
         "BiasTpred": Meaning("none", "the bias is predicted to stay", ("0",)),
