@@ -23,7 +23,7 @@ from jaxmpc.files import read_named_toml
 from jaxmpc.process.actuator import Actuator
 from jaxmpc.process.process import Cv, KeyFigure, ModelSource, Mv, PlantSource, Process, Variable
 from jaxmpc.process.reference import Reference
-from jaxmpc.process.responses import TransferFunctionSection, responses_of
+from jaxmpc.process.responses import LONGEST, TransferFunctionSection, responses_of
 
 DEFAULT_PROCESS = "gas-lifted-well"  # of studies that name none
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
@@ -90,7 +90,7 @@ class ModelSection(Section, frozen=True):
     steps: Numbers = {}
     disturbance_steps: Numbers = {}
     schedule: dict[str, tuple[float, ...]] = {}
-    samples: Annotated[int, msgspec.Meta(ge=1)] = 250
+    samples: Annotated[int, msgspec.Meta(ge=1, le=LONGEST)] = 250
 
 
 class WindowsSection(Section, frozen=True):

@@ -20,9 +20,9 @@ from jaxmpc.errors import InputError, near
 from jaxmpc.model.step_response import StepResponseModel, shift_free_response
 from jaxmpc.process.actuator import Actuator, Actuators
 from jaxmpc.process.plant import JaxPlant, Outputs, Parameter, Signals, checked_parameters
+from jaxmpc.process.responses import LONGEST
 
 NOTHING = 1e-9  # of the largest value of a response: what counts as no response yet
-LONGEST = 20_000  # samples of a response
 KNOBS = (
     Parameter("gain", "1", 1.0, "factor on the gain"),
     Parameter("dead_time", "s", 0.0, "added dead time"),

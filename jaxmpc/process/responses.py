@@ -12,6 +12,8 @@ from jaxmpc.errors import InputError, near
 from jaxmpc.model.transfer_function import TransferFunction
 from jaxmpc.process.process import Response
 
+LONGEST = 20_000  # samples of a response
+
 
 class TransferFunctionSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One entry, of an MV or of a measured disturbance; see `TransferFunction`."""

@@ -256,6 +256,14 @@ def test_a_wrong_transfer_function_is_refused_with_its_path(change, field):
     assert error.value.field == f"model.transfer_functions[0].{field}"
 
 
+@pytest.mark.parametrize("samples", [0, 20_001, 1e9])
+def test_a_model_of_no_or_too_many_samples_is_refused(samples):
+    body = written()
+    body["model"]["samples"] = samples
+    with pytest.raises(InputError, match=r"model\.samples"):
+        process_of(body)
+
+
 def test_a_pair_twice_a_file_besides_and_a_point_of_nothing_are_refused():
     for change, field in (
         (lambda m: m["transfer_functions"].append(m["transfer_functions"][0]), "transfer_functions[2]"),
