@@ -22,7 +22,7 @@ COMPOSITION_ROOT = "jaxmpc/cli/"
 APPS = "studies/notebooks/"  # what a user opens and edits: puts studies and figures together
 DOORS = {
     "highspy": ("jaxmpc/integer/highs.py",),
-    "fmpy": ("identify/fmu.py", "identify/fmu_worker.py"),
+    "fmpy": ("identify/fmu.py", "identify/fmu_worker.py", "identify/fmu_exchange.py"),
     "matplotlib": ("figures/",),
     "dask": ("studies/",),
     "distributed": ("studies/",),

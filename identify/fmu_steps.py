@@ -1,0 +1,480 @@
+"""Identification of any FMU by step tests: every input alone, up and down, in full and half size, from a settled point.
+
+A response is the difference of a stepped run and one without the step, at the same times: what the FMU does by itself, a rest
+of settling or noise that repeats after a reset, is in both. The model is the mean of up and down (`identify.step_test`); the
+other tests judge it (`identify.fmu_verdicts`). Noise that does not repeat is averaged over runs. ``jaxmpc identify FILE.fmu``
+calls it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import hashlib
+import itertools
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from identify.fmu import FmuPlant
+from identify.fmu_description import BITS, REALS, FmuDescription, FmuVariable, Value
+from identify.fmu_process import TIME_LIMIT, FmuProcess
+from identify.fmu_verdicts import Tests, advice_of, judged
+from identify.step_test import SETTLE_SAMPLES, apply_sequence
+from jaxmpc.check import is_count, is_number
+from jaxmpc.controller.schedule import ModelSchedule, make_schedule
+from jaxmpc.errors import InputError, near
+from jaxmpc.model.identification import Identification, Record
+from jaxmpc.model.step_response import StepResponseModel, make_model
+
+WAYS = {"up": 1.0, "down": -1.0, "half up": 0.5, "half down": -0.5}  # sizes of the tests
+SHARE = 0.01  # of the range of an input, or of its value: a step if none is given
+LONGEST = 64  # times as long as a response an FMU may take to settle
+STILL = 1e-6  # of all that it has moved: it has settled
+PRECISE = 0.0012  # of the largest coefficient: standard error that repetitions are to reach
+MOST_REPEATS = 400
+MOST_SAMPLES = 400_000  # simulated for the tests of one input
+REPEATED = 1e-9  # of the largest value: two runs are the same
+
+Told = Callable[[str], None]
+
+
+class Moved(NamedTuple):
+    """An MV or DV of an FMU.
+
+    Attributes:
+        channel: its name in the model.
+        variable: of the FMU.
+        rest: where it stands before the steps [its unit].
+        targets: by test, where it is stepped to.
+    """
+
+    channel: str
+    variable: FmuVariable
+    rest: float
+    targets: dict[str, float]
+
+
+def identify_fmu(
+    path: str | Path,
+    mvs: Mapping[str, tuple[Value | None, float | None]],
+    cvs: Sequence[str],
+    dt: float,
+    samples: int = 250,
+    *,
+    dvs: Mapping[str, tuple[Value | None, float | None]] | None = None,
+    start: Mapping[str, Value] | None = None,
+    settle: float | None = None,
+    time_limit: float = TIME_LIMIT,
+    told: Told | None = None,
+) -> Identification:
+    """Identify a step-response model of an FMU, and judge it.
+
+    Args:
+        path: of the FMU, of FMI 2.0 or 3.0, for co-simulation or model exchange.
+        mvs: by the names of its variables, where they stand (their start values if None) and the size of their steps (the
+            least that makes sense if None) [their unit].
+        cvs: names of its variables.
+        dt: sampling interval [s].
+        samples: N, the number of coefficients.
+        dvs: as `mvs`, of measured disturbances.
+        start: start values and parameters by name.
+        settle: simulated at the working point before the steps [s]; by default until it stands still.
+        time_limit: for one call of the FMU [s].
+        told: called with a sentence on what is being done.
+
+    Returns:
+        Model, verdicts, and the tests as records; those of half size, which the model has not seen, as left out.
+
+    Raises:
+        InputError: for a file, variable, value or step that cannot be, before anything is simulated.
+        PlantError: if the FMU fails.
+    """
+    tests = _Tests(path, mvs, cvs, dt, samples, dvs or {}, start or {}, settle, time_limit, told)
+    return tests.identification()
+
+
+def identify_fmu_schedule(
+    path: str | Path,
+    mvs: Mapping[str, tuple[Value | None, float | None]],
+    cvs: Sequence[str],
+    dt: float,
+    samples: int,
+    at: Mapping[str, Sequence[Value]],
+    *,
+    told: Told | None = None,
+    **more,
+) -> ModelSchedule:
+    """A gain schedule: models as of `identify_fmu` over a grid of one or two of the MVs, from steps up and down.
+
+    Raises:
+        InputError: as `identify_fmu`, and for a grid that is none.
+    """
+    if len(at) not in (1, 2):
+        raise InputError("--at", list(at), f"values of one or two of the MVs {', '.join(mvs)}")
+    for mv, values in at.items():
+        if mv not in mvs:
+            raise InputError("--at", mv, f"one of the MVs {', '.join(mvs)}", near(mv, mvs))
+        if len(values) < 2 or len(set(values)) != len(values):
+            raise InputError(f"--at {mv}", list(values), "two or more distinct values")
+    places = [dict(zip(at, values, strict=True)) for values in itertools.product(*at.values())]
+
+    def tests(place: Mapping[str, Value]) -> _Tests:
+        moved = {mv: (place.get(mv, value), step) for mv, (value, step) in mvs.items()}
+        return _Tests(path, moved, cvs, dt, samples, told=told, ways=("up", "down"), **more)
+
+    prepared = [tests(place) for place in places]  # all are checked before any is simulated
+    names = [one.channel for one in prepared[0].inputs if one.variable.name in at]
+    models = []
+    for number, one in enumerate(prepared, 1):
+        one.tell(f"working point {number} of {len(places)}")
+        models.append(one.identification().model)
+    return make_schedule(models, names)
+
+
+class _Tests:
+    """The tests of one working point; arguments as of `identify_fmu`."""
+
+    def __init__(
+        self, path, mvs, cvs, dt, samples, dvs=(), start=(), settle=None, time_limit=TIME_LIMIT,
+        told=None, ways=tuple(WAYS),
+    ):  # fmt: skip
+        if not is_count(samples) or samples < 2:
+            raise InputError("--samples", samples, "a whole number of 2 or more")
+        if not is_number(dt) or dt <= 0:
+            raise InputError("--dt", dt, "a positive sampling interval [s]")
+        if settle is not None and not (is_number(settle) and settle >= 0):
+            raise InputError("--settle", settle, "a number of seconds, 0 or more")
+        for option, given in (("--mv", mvs), ("--cv", cvs)):
+            if not given:
+                raise InputError(option, "nothing", "one or more variables, which jaxmpc fmu info lists")
+        self.path = Path(path)
+        self.dt, self.samples, self.given_settle, self._told = float(dt), samples, settle, told
+        self.notes: list[str] = []
+        self.start, self.ways = dict(start or {}), ways
+        given = {**mvs, **dict(dvs or {})}
+        twice = set(mvs) & set(dvs or ())
+        if twice:
+            raise InputError("--dv", min(twice), "a variable that is no MV")
+        with FmuProcess(path, time_limit) as fmu:
+            self.description: FmuDescription = fmu.description
+        channels = legal_names((*given, *cvs))
+        self.renamed = {c: name for name, c in channels.items() if c != name}
+        self.inputs = [self._moved(channels[n], n, n in mvs, *given[n]) for n in given]
+        self.count, self.cvs = len(mvs), [channels[name] for name in cvs]
+        self.cv_variables = [self.description.variable("--cv", name) for name in cvs]
+        self.block = max(samples, SETTLE_SAMPLES)
+        self.plant_of = lambda settle: FmuPlant(
+            path,
+            [one.channel for one in self.inputs],
+            self.cvs,
+            dt=self.dt,
+            variables=self.renamed,
+            start=self.start,
+            working_point={one.channel: _value(one.variable, one.rest) for one in self.inputs},
+            settle=settle,
+            stop_time=(settle + LONGEST * self.block * dt) + (samples + 1) * dt,
+            time_limit=time_limit,
+            description=self.description,
+        )
+        self.rest = np.array([one.rest for one in self.inputs])
+        self.plant_of(0.0)  # checked before anything is simulated
+
+    def tell(self, what: str) -> None:
+        """Say what is being done."""
+        if self._told is not None:
+            self._told(what)
+
+    # ------------------------------------------------------------------------------------------------ what is stepped
+
+    def _moved(self, channel: str, name: str, is_mv: bool, value: Value | None, step: float | None) -> Moved:
+        option = "--mv" if is_mv else "--dv"
+        found = self.description.variable(option, name)
+        if not found.movable or found.type not in (*REALS, *BITS, "Boolean", "Enumeration"):
+            what = f"{found.type}, {found.variability} {found.causality}"
+            raise InputError(option, name, f"an input or a tunable parameter that holds a number ({what})")
+        rest = found.number
+        own = self.start.get(name) if value is None else value
+        if own is not None:
+            rest = float(found.exactly(f"{option} {name}", own))
+        if rest is None:
+            raise InputError(
+                f"{option} {name}", "no value", f"{found.expected}: the FMU has no start value"
+            )
+        if step is not None and not (is_number(step) and step != 0):
+            raise InputError(f"{option} {name}", step, "a step that is not zero")
+        targets = self._targets(found, rest, None if step is None else abs(step))
+        if not {"up", "down"} & set(targets):
+            expected = f"a step that stays {found.expected}, from {rest:g} up or down"
+            raise InputError(f"{option} {name}", step, expected)
+        for way, other in (("up", "down"), ("down", "up")):
+            if way not in targets:
+                self.notes.append(
+                    f"{channel} can be stepped {other} only from {rest:g}: the model is that of steps {other}"
+                )
+        return Moved(channel, found, rest, targets)
+
+    def _targets(self, v: FmuVariable, rest: float, size: float | None) -> dict[str, float]:
+        """By test, where an input is stepped to: values that it can have."""
+        if v.type == "Enumeration" and size is None:
+            above = [value for value in v.items.values() if value > rest]
+            below = [value for value in v.items.values() if value < rest]
+            found = {"up": min(above, default=None), "down": max(below, default=None)}
+            return {way: float(to) for way, to in found.items() if to is not None}
+        if size is None:
+            size = self._size(v, rest)
+        found = {}
+        for way, share in WAYS.items():
+            wanted = rest + share * size
+            to = float(v.nearest(wanted))
+            if way in self.ways and abs(to - wanted) <= 1e-9 * size and to != rest:
+                found[way] = to
+        return found
+
+    def _size(self, v: FmuVariable, rest: float) -> float:
+        """Of a step that is not given."""
+        if v.type == "Boolean":
+            return 1.0
+        low, high = v.limits
+        bounded = v.low is not None and v.high is not None
+        size = SHARE * ((high - low) if bounded else abs(rest))
+        if v.type in BITS:
+            return max(1.0, math.floor(size))
+        if not size:
+            self.notes.append(f"steps of {v.name} are of 1: it stands at 0 and declares no range; give a size")
+        return size or 1.0
+
+    # -------------------------------------------------------------------------------------------------------- the runs
+
+    def identification(self) -> Identification:
+        """Make all tests."""
+        settle = self.given_settle if self.given_settle is not None else self._settled()
+        with self.plant_of(settle) as plant:
+            return self._identified(plant, settle)
+
+    def _settled(self) -> float:
+        """How long the FMU takes until it stands still at the working point [s]."""
+        with self.plant_of(0.0) as plant:
+            first = plant.init().cv
+            record, length, slopes = [first], self.block, []
+            while len(record) <= LONGEST * self.block // 2:
+                self.tell(f"settling, {len(record) * self.dt:g} s simulated")
+                held = np.tile(self.rest, (length, 1))
+                cv, _ = apply_sequence(plant, None, held, np.zeros((length, 0)))
+                record.extend(cv)
+                run = np.array(record)
+                movement, noise = _movement(cv)
+                still = STILL * np.ptp(run, axis=0) + REPEATED * np.abs(run).max(axis=0) + 8 * noise
+                if (movement <= still).all():
+                    return 0.0 if len(record) == length + 1 and _movement(run)[0].max() == 0 else (
+                        (len(record) - 1) * self.dt
+                    )
+                slopes.append(movement / length)
+                if len(slopes) > 2 and np.allclose(slopes[-1], slopes[-2], rtol=0.01):
+                    break  # it will go on like this
+                length = len(record) - 1
+        for i in np.flatnonzero(movement > still):
+            slope = 2 * movement[i] / (length * self.dt)
+            self.notes.append(
+                f"{self.cvs[i]} does not come to rest at the working point: it still moves by about {slope:.3g} per second "
+                f"after {(len(record) - 1) * self.dt:g} s. The responses are differences to a run without steps"
+            )
+        return (len(record) - 1) * self.dt
+
+    def _runs(self, plant: FmuPlant, mv: np.ndarray, count: int) -> Float[np.ndarray, "run sample cv"]:
+        """CVs of runs with held MVs from the working point on, the first sample before they act."""
+        runs = []
+        for _ in range(count):
+            first = plant.init().cv
+            cv, _ = apply_sequence(
+                plant, None, np.tile(mv, (self.samples, 1)), np.zeros((self.samples, 0))
+            )
+            runs.append(np.vstack([first, cv]))
+        return np.array(runs)
+
+    def _identified(self, plant: FmuPlant, settle: float) -> Identification:
+        self.tell("runs without steps")
+        still = self._runs(plant, self.rest, 2)
+        scale = np.abs(still).max(axis=(0, 1))
+        apart = np.abs(still[0] - still[1]).max(axis=0)
+        noise = np.where(apart > REPEATED * scale, (still[0] - still[1]).std(axis=0) / math.sqrt(2), 0.0)
+        shape = (len(self.cvs), len(self.inputs), self.samples)
+        responses = {way: np.full(shape, np.nan) for way in self.ways}
+        errors, changes = np.zeros(shape[:2]), np.zeros(shape[:2])
+        means: dict[tuple[int, str], np.ndarray] = {}
+        most = 2
+        for j, one in enumerate(self.inputs):
+            self.tell(f"steps of {one.channel}, input {j + 1} of {len(self.inputs)}")
+            counts = self._tested(plant, j, one, still.mean(axis=0), noise, settle, means)
+            most = max(most, counts)
+            step = abs(one.targets.get("up", one.targets.get("down", 0.0)) - one.rest)
+            both = {"up", "down"} <= set(one.targets)
+            errors[:, j] = noise / step / math.sqrt(counts) * (math.sqrt(0.5) if both else math.sqrt(2))
+        if noise.any() and most > 2:
+            self.tell("runs without steps, to average the noise")
+            still = np.concatenate([still, self._runs(plant, self.rest, most - 2)])
+        base = still.mean(axis=0) if noise.any() else still[0]
+        for (j, way), mean in means.items():
+            one = self.inputs[j]
+            change = mean - base
+            responses[way][:, j] = (change[1:] / (one.targets[way] - one.rest)).T
+            changes[:, j] = np.maximum(changes[:, j], np.abs(change).max(axis=0))
+        with np.errstate(all="ignore"):
+            pairs = np.stack([responses["up"], responses["down"]])
+            mean = np.where(np.isnan(pairs).any(axis=0), np.nansum(pairs, axis=0), pairs.mean(axis=0))
+        point = base.mean(axis=0) if noise.any() else base[0]
+        model = self._model(mean, point, settle, {})
+        seen = Tests(
+            model, responses, errors, changes, np.maximum(scale, changes.max(axis=1)), base,
+            [v.type in REALS for v in self.cv_variables],
+        )  # fmt: skip
+        verdicts, notes = judged(seen)
+        notes = (*self.notes, *self._noise_notes(noise, most), *notes)
+        told = {"settled": not any("not settled" in row.says for row in verdicts)}
+        told |= {"verdicts": [list(row) for row in verdicts], "notes": list(notes)}
+        model = self._model(mean, point, settle, told)
+        return Identification(
+            model,
+            verdicts,
+            notes,
+            advice_of(verdicts, model),
+            bands=np.repeat(1.96 * errors[:, :, None], self.samples, axis=2) if noise.any() else None,
+            alternatives={way: found for way, found in responses.items() if np.isfinite(found).any()},
+            records=self._records(means, base, mean),
+        )
+
+    def _tested(self, plant, j, one, base, noise, settle, means) -> int:
+        """Make the tests of an input; returns how many runs each mean is of."""
+        total, count = {}, 1
+        for way, target in one.targets.items():
+            total[way] = self._runs(plant, self._stepped(j, target), 1)[0]
+        if noise.any():
+            count = self._repeats(one, total, base, noise, settle)
+            for way, target in one.targets.items():
+                more = count - 1 if "half" not in way else max(count // 4, 1) - 1
+                if more:
+                    self.tell(f"{one.channel} {way}: {more} more runs, to average the noise")
+                    again = self._runs(plant, self._stepped(j, target), more)
+                    total[way] = (total[way] + again.sum(axis=0)) / (more + 1)
+        means.update({(j, way): run for way, run in total.items()})
+        return count
+
+    def _stepped(self, j: int, target: float) -> np.ndarray:
+        mv = self.rest.copy()
+        mv[j] = target
+        return mv
+
+    def _repeats(self, one, total, base, noise, settle) -> int:
+        """How often a test is made, so that the mean of the noise is small beside the responses."""
+        smooth = max(self.samples // 10, 1)
+        kernel = np.ones(smooth) / smooth
+        need = 1.0
+        for i in np.flatnonzero(noise):
+            ways = [way for way in ("up", "down") if way in one.targets]
+            changes = [np.abs(np.convolve((total[w] - base)[1:, i], kernel, "valid")).max() for w in ways]
+            peak, error = max(changes), noise[i] * (math.sqrt(0.5) if len(ways) == 2 else math.sqrt(2))
+            if peak > 5 * noise[i] / math.sqrt(smooth):
+                need = max(need, (error / (PRECISE * peak)) ** 2)
+        cost = len(one.targets) * (self.samples + settle / self.dt)
+        return int(min(math.ceil(need), MOST_REPEATS, max(MOST_SAMPLES / cost, 2)))
+
+    # ------------------------------------------------------------------------------------------------- what is returned
+
+    def _model(self, mean: np.ndarray, settled: np.ndarray, settle: float, told: dict) -> StepResponseModel:
+        path = self.path.resolve()
+        units = [one.variable.unit or "1" for one in self.inputs]
+        names = [one.channel for one in self.inputs]
+        point = dict(zip((*names, *self.cvs), (*self.rest.tolist(), *settled.tolist()), strict=True))
+        own = {one.variable.name: one.rest for one in self.inputs[self.count :]}
+        facts = {
+            "plant": "fmu",
+            "plant_hash": self.plant_of(settle).facts()["hash"],
+            "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            "fmu": str(path),
+            "fmu_hash": hashlib.sha256(path.read_bytes()).hexdigest(),
+            "variables": self.renamed,
+            "start": self.start | {n: _value(self.description.variable("", n), x) for n, x in own.items()},
+            "settle": settle,
+            "stops": self.description.experiment["stop"] is not None,
+            "steps": {
+                one.channel: {way: to - one.rest for way, to in one.targets.items()} for one in self.inputs
+            },
+            "ranges": {
+                one.channel: list(one.variable.limits)
+                for one in self.inputs[: self.count]
+                if all(map(math.isfinite, one.variable.limits)) and one.variable.type not in BITS
+            },
+            "actuators": {
+                one.channel: how for one in self.inputs[: self.count] if (how := _actuator(one.variable))
+            },
+        }
+        count = self.count
+        return make_model(
+            mean[:, :count], self.dt, self.cvs, names[:count],
+            cv_units=[v.unit or "1" for v in self.cv_variables], mv_units=units[:count],
+            working_point=point, provenance=facts | told,
+            dv_coefficients=mean[:, count:], dv_names=names[count:], dv_units=units[count:],
+        )  # fmt: skip
+
+    def _records(self, means: Mapping[tuple[int, str], np.ndarray], base, mean) -> tuple[Record, ...]:
+        out, times = [], np.arange(self.samples + 1) * self.dt
+        for (j, way), measured in means.items():
+            one = self.inputs[j]
+            change = one.targets[way] - one.rest
+            inputs = np.tile(self._stepped(j, one.targets[way]), (self.samples + 1, 1))
+            predicted = base + np.vstack([np.zeros(len(self.cvs)), change * mean[:, j].T])
+            unit = f" {one.variable.unit}" if one.variable.unit else ""
+            used = np.full(self.samples + 1, "half" not in way)
+            out.append(Record(f"{one.channel} {change:+.4g}{unit}", times, inputs, measured, predicted, used))
+        return tuple(out)
+
+    def _noise_notes(self, noise: np.ndarray, most: int) -> list[str]:
+        return [
+            f"{cv} has noise that differs from run to run, of standard deviation {sigma:.3g}: means of up to {most} runs"
+            for cv, sigma in zip(self.cvs, noise.tolist(), strict=True)
+            if sigma
+        ] + [
+            f"{name} is called {channel} here: a process file has names of letters, digits and '_'"
+            for channel, name in self.renamed.items()
+        ]
+
+
+def legal_names(names: Sequence[str]) -> dict[str, str]:
+    """Names that a process file may have, by those of an FMU: ``tank[1].level`` as ``tank_1_level``."""
+    out: dict[str, str] = {}
+    for name in names:
+        plain = "_".join(re.findall(r"[A-Za-z0-9]+", name)) if re.search(r"\W", name) else name
+        plain = (plain if plain[:1].isalpha() and plain.isascii() else f"v_{plain.strip('_')}")[:60]
+        own, k = plain, 1
+        while own in out.values() or (own != name and own in names):
+            k += 1
+            own = f"{plain}_{k}"
+        out[name] = own
+    return out
+
+
+def _value(v: FmuVariable, number: float) -> Value:
+    """A number as what its variable holds."""
+    return v.nearest(number)
+
+
+def _actuator(v: FmuVariable) -> dict | None:
+    """How an MV of this type moves, in the words of a process file."""
+    if v.type == "Boolean":
+        return {"kind": "on-off"}
+    if v.type == "Enumeration":
+        return {"kind": "values", "values": sorted(v.items.values())}
+    return {"kind": "stepped", "step": 1.0} if v.type in BITS else None
+
+
+def _movement(cv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """By how much the second half of a record differs from the first in the mean, and the error of that by noise."""
+    half = len(cv) // 2
+    movement = np.abs(cv[half:].mean(axis=0) - cv[:half].mean(axis=0))
+    noise = np.diff(cv, n=2, axis=0).std(axis=0) / math.sqrt(6)
+    return movement, noise * 2 / math.sqrt(len(cv)) / 2
