@@ -11,7 +11,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from fmpy.sundials import NV_DATA_S, CVodeSolver
+from fmpy.sundials import NV_DATA_S, CVodeSolver, SUNContext_PushErrHandler
+from fmpy.sundials.libraries import sundials_core
 
 TOLERANCE = 1e-8  # relative; small steps of an input change large states by little
 MAX_STEPS = 1_000_000  # of the solver between two points; the time limit of a call ends it before
@@ -23,6 +24,11 @@ class _Solver(CVodeSolver):
 
     failure: Exception | None = None
 
+    def __init__(self, **options: Any):
+        super().__init__(**options)
+        sundials_core.SUNContext_ClearErrHandlers(self.sunctx)  # what it prints is in the error, too
+        SUNContext_PushErrHandler(self.sunctx, self.ehfun_, None)
+
     def f(self, t: float, y: Any, ydot: Any, user_data: Any) -> int:
         """Derivatives; asks for a smaller step where they are no numbers."""
         try:
@@ -30,8 +36,13 @@ class _Solver(CVodeSolver):
         except Exception as error:
             self.failure = error
             return -1
-        sound = np.isfinite(np.ctypeslib.as_array(NV_DATA_S(ydot), (self.nx,))).all()
-        return 0 if sound else 1
+        rates = np.ctypeslib.as_array(NV_DATA_S(ydot), (self.nx,))
+        if np.isfinite(rates).all():
+            self.failure = None
+            return 0
+        k = int(np.flatnonzero(~np.isfinite(rates))[0])
+        self.failure = ArithmeticError(f"the derivative of state {k + 1} is {rates[k]:g} at t = {t:.10g} s")
+        return 1
 
     def g(self, t: float, y: Any, gout: Any, user_data: Any) -> int:
         """Event indicators."""

@@ -36,7 +36,7 @@ WAYS = {"up": 1.0, "down": -1.0, "half up": 0.5, "half down": -0.5}  # sizes of 
 SHARE = 0.01  # of the range of an input, or of its value: a step if none is given
 LONGEST = 64  # times as long as a response an FMU may take to settle
 STILL = 1e-6  # of all that it has moved: it has settled
-PRECISE = 0.0012  # of the largest coefficient: standard error that repetitions are to reach
+PRECISE = 0.001  # of the largest coefficient: standard error that repetitions are to reach
 MOST_REPEATS = 400
 MOST_SAMPLES = 400_000  # simulated for the tests of one input
 REPEATED = 1e-9  # of the largest value: two runs are the same
@@ -203,9 +203,7 @@ class _Tests:
         if own is not None:
             rest = float(found.exactly(f"{option} {name}", own))
         if rest is None:
-            raise InputError(
-                f"{option} {name}", "no value", f"{found.expected}: the FMU has no start value"
-            )
+            raise InputError(f"{option} {name}", "no value", f"{found.expected}: the FMU has no start value")
         if step is not None and not (is_number(step) and step != 0):
             raise InputError(f"{option} {name}", step, "a step that is not zero")
         targets = self._targets(found, rest, None if step is None else abs(step))
@@ -246,7 +244,9 @@ class _Tests:
         if v.type in BITS:
             return max(1.0, math.floor(size))
         if not size:
-            self.notes.append(f"steps of {v.name} are of 1: it stands at 0 and declares no range; give a size")
+            self.notes.append(
+                f"steps of {v.name} are of 1: it stands at 0 and declares no range; give a size"
+            )
         return size or 1.0
 
     # -------------------------------------------------------------------------------------------------------- the runs
@@ -271,8 +271,10 @@ class _Tests:
                 movement, noise = _movement(cv)
                 still = STILL * np.ptp(run, axis=0) + REPEATED * np.abs(run).max(axis=0) + 8 * noise
                 if (movement <= still).all():
-                    return 0.0 if len(record) == length + 1 and _movement(run)[0].max() == 0 else (
-                        (len(record) - 1) * self.dt
+                    return (
+                        0.0
+                        if len(record) == length + 1 and _movement(run)[0].max() == 0
+                        else ((len(record) - 1) * self.dt)
                     )
                 slopes.append(movement / length)
                 if len(slopes) > 2 and np.allclose(slopes[-1], slopes[-2], rtol=0.01):
@@ -291,9 +293,7 @@ class _Tests:
         runs = []
         for _ in range(count):
             first = plant.init().cv
-            cv, _ = apply_sequence(
-                plant, None, np.tile(mv, (self.samples, 1)), np.zeros((self.samples, 0))
-            )
+            cv, _ = apply_sequence(plant, None, np.tile(mv, (self.samples, 1)), np.zeros((self.samples, 0)))
             runs.append(np.vstack([first, cv]))
         return np.array(runs)
 
@@ -312,9 +312,7 @@ class _Tests:
             self.tell(f"steps of {one.channel}, input {j + 1} of {len(self.inputs)}")
             counts = self._tested(plant, j, one, still.mean(axis=0), noise, settle, means)
             most = max(most, counts)
-            step = abs(one.targets.get("up", one.targets.get("down", 0.0)) - one.rest)
-            both = {"up", "down"} <= set(one.targets)
-            errors[:, j] = noise / step / math.sqrt(counts) * (math.sqrt(0.5) if both else math.sqrt(2))
+            errors[:, j] = noise / math.sqrt(counts) * _error_of(one)
         if noise.any() and most > 2:
             self.tell("runs without steps, to average the noise")
             still = np.concatenate([still, self._runs(plant, self.rest, most - 2)])
@@ -335,6 +333,8 @@ class _Tests:
         )  # fmt: skip
         verdicts, notes = judged(seen)
         notes = (*self.notes, *self._noise_notes(noise, most), *notes)
+        silent = np.array([row.verdict == "none" for row in verdicts]).reshape(mean.shape[:2])
+        mean[silent] = 0.0
         told = {"settled": not any("not settled" in row.says for row in verdicts)}
         told |= {"verdicts": [list(row) for row in verdicts], "notes": list(notes)}
         model = self._model(mean, point, settle, told)
@@ -377,7 +377,7 @@ class _Tests:
         for i in np.flatnonzero(noise):
             ways = [way for way in ("up", "down") if way in one.targets]
             changes = [np.abs(np.convolve((total[w] - base)[1:, i], kernel, "valid")).max() for w in ways]
-            peak, error = max(changes), noise[i] * (math.sqrt(0.5) if len(ways) == 2 else math.sqrt(2))
+            peak, error = max(changes), noise[i] * _error_of(one) * abs(one.targets[ways[0]] - one.rest)
             if peak > 5 * noise[i] / math.sqrt(smooth):
                 need = max(need, (error / (PRECISE * peak)) ** 2)
         cost = len(one.targets) * (self.samples + settle / self.dt)
@@ -422,14 +422,17 @@ class _Tests:
         )  # fmt: skip
 
     def _records(self, means: Mapping[tuple[int, str], np.ndarray], base, mean) -> tuple[Record, ...]:
-        out, times = [], np.arange(self.samples + 1) * self.dt
-        for (j, way), measured in means.items():
+        out, times = [], np.arange(-1, self.samples + 1) * self.dt  # from the sample before the step on
+        for (j, way), run in means.items():
             one = self.inputs[j]
             change = one.targets[way] - one.rest
-            inputs = np.tile(self._stepped(j, one.targets[way]), (self.samples + 1, 1))
-            predicted = base + np.vstack([np.zeros(len(self.cvs)), change * mean[:, j].T])
+            inputs = np.vstack(
+                [self.rest, np.tile(self._stepped(j, one.targets[way]), (self.samples + 1, 1))]
+            )
+            measured = np.vstack([base[0], run])
+            predicted = np.vstack([base[0], base]) + np.pad(change * mean[:, j].T, ((2, 0), (0, 0)))
             unit = f" {one.variable.unit}" if one.variable.unit else ""
-            used = np.full(self.samples + 1, "half" not in way)
+            used = np.full(self.samples + 2, "half" not in way)
             out.append(Record(f"{one.channel} {change:+.4g}{unit}", times, inputs, measured, predicted, used))
         return tuple(out)
 
@@ -456,6 +459,12 @@ def legal_names(names: Sequence[str]) -> dict[str, str]:
             own = f"{plain}_{k}"
         out[name] = own
     return out
+
+
+def _error_of(one: Moved) -> float:
+    """Standard error of a coefficient from runs with noise of 1 [per input unit]."""
+    shares = [1 / (one.targets[way] - one.rest) for way in ("up", "down") if way in one.targets]
+    return math.hypot(*shares, sum(shares)) / len(shares)  # of the tests, and of the run without steps
 
 
 def _value(v: FmuVariable, number: float) -> Value:

@@ -122,17 +122,22 @@ def _description(variables, kind, states, indicators, step, attributes, units):
     lines, first = list(variables), len(variables)
     for k in range(states):
         lines.append(_variable("Real", f"x{k}", 20 + k, "local", "continuous"))
-        lines.append(_variable("Real", f"der(x{k})", 30 + k, "local", "continuous", derivative=first + 2 * k + 1))
+        lines.append(
+            _variable("Real", f"der(x{k})", 30 + k, "local", "continuous", derivative=first + 2 * k + 1)
+        )
     outputs = [i for i, line in enumerate(lines, 1) if 'causality="output"' in line]
     listed = "".join(f'<Unknown index="{i}"/>' for i in outputs)
     rates = "".join(f'<Unknown index="{first + 2 * k + 2}"/>' for k in range(states))
+    rates = f"<Derivatives>{rates}</Derivatives>" if states else ""
     experiment = f'<DefaultExperiment startTime="0" stopTime="100" stepSize="{step}"/>' if step else ""
-    unit = f"<UnitDefinitions>{''.join(f'<Unit name={u!r}/>' for u in units)}</UnitDefinitions>" if units else ""
+    unit = (
+        f"<UnitDefinitions>{''.join(f'<Unit name={u!r}/>' for u in units)}</UnitDefinitions>" if units else ""
+    )
     items = "".join(f'<Item name="{n}" value="{v}"/>' for n, v in (("off", 0), ("slow", 1), ("fast", 4)))
     return f"""<?xml version="1.0" encoding="UTF-8"?>
 <fmiModelDescription fmiVersion="2.0" modelName="plant" guid="{{plant}}" numberOfEventIndicators="{indicators}">
 <{kind} modelIdentifier="plant" {attributes}/>{unit}
 <TypeDefinitions><SimpleType name="Mode"><Enumeration>{items}</Enumeration></SimpleType></TypeDefinitions>{experiment}
 <ModelVariables>{"".join(lines)}</ModelVariables>
-<ModelStructure><Outputs>{listed}</Outputs><Derivatives>{rates}</Derivatives></ModelStructure>
+<ModelStructure><Outputs>{listed}</Outputs>{rates}</ModelStructure>
 </fmiModelDescription>"""
