@@ -83,7 +83,8 @@ def _verdicts(found: Identification) -> str:
     rows = [
         [
             Markup(
-                f'<span style="background:{COLOURS[row.verdict]};color:#fff;padding:1px 8px;border-radius:4px">{row.verdict}</span>'
+                f'<span style="background:{COLOURS[row.verdict]};color:#fff;padding:1px 8px;border-radius:4px">'
+                f"{row.verdict}</span>"
             ),
             row.input,
             row.cv,

@@ -1,4 +1,4 @@
-"""An FMU of any process, for co-simulation or model exchange, as a plant for closed loops (`jaxmpc.process.plant.StatefulPlant`).
+"""An FMU of any process, for co-simulation or model exchange, as a plant for loops (`jaxmpc.process.plant.StatefulPlant`).
 
 `FmuPlant` maps MVs, CVs and disturbances to variables of the FMU by name, moves the actuators, and steps the FMU in a
 process of its own (`identify.fmu_process`). FMPy's own simulation would interpolate continuous inputs between samples; the

@@ -1,28 +1,25 @@
 """Identification of any FMU by step tests: every input alone, up and down, in full and half size, from a settled point.
 
-A response is the difference of a stepped run and one without the step, at the same times: what the FMU does by itself, a rest
-of settling or noise that repeats after a reset, is in both. The model is the mean of up and down (`identify.step_test`); the
-other tests judge it (`identify.fmu_verdicts`). Noise that does not repeat is averaged over runs. ``jaxmpc identify FILE.fmu``
-calls it.
+A response is the difference of a stepped run and one without the step, at the same times: what the FMU does by itself, a
+rest of settling or noise that repeats after a reset, is in both. The model is the mean of up and down; the other tests judge
+it (`identify.fmu_verdicts`). Noise that does not repeat is averaged over runs. ``jaxmpc identify FILE.fmu`` calls it.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import datetime
 import hashlib
 import itertools
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from identify.fmu import FmuPlant
-from identify.fmu_description import BITS, REALS, FmuDescription, FmuVariable, Value
+from identify.fmu_description import BITS, REALS, FmuDescription, Value
+from identify.fmu_inputs import WAYS, Moved, actuator_of, error_of, legal_names, moved
 from identify.fmu_process import TIME_LIMIT, FmuProcess
 from identify.fmu_verdicts import Tests, advice_of, judged
 from identify.step_test import SETTLE_SAMPLES, apply_sequence
@@ -32,8 +29,6 @@ from jaxmpc.errors import InputError, near
 from jaxmpc.model.identification import Identification, Record
 from jaxmpc.model.step_response import StepResponseModel, make_model
 
-WAYS = {"up": 1.0, "down": -1.0, "half up": 0.5, "half down": -0.5}  # sizes of the tests
-SHARE = 0.01  # of the range of an input, or of its value: a step if none is given
 LONGEST = 64  # times as long as a response an FMU may take to settle
 STILL = 1e-6  # of all that it has moved: it has settled
 PRECISE = 0.001  # of the largest coefficient: standard error that repetitions are to reach
@@ -42,22 +37,6 @@ MOST_SAMPLES = 400_000  # simulated for the tests of one input
 REPEATED = 1e-9  # of the largest value: two runs are the same
 
 Told = Callable[[str], None]
-
-
-class Moved(NamedTuple):
-    """An MV or DV of an FMU.
-
-    Attributes:
-        channel: its name in the model.
-        variable: of the FMU.
-        rest: where it stands before the steps [its unit].
-        targets: by test, where it is stepped to.
-    """
-
-    channel: str
-    variable: FmuVariable
-    rest: float
-    targets: dict[str, float]
 
 
 def identify_fmu(
@@ -125,8 +104,8 @@ def identify_fmu_schedule(
     places = [dict(zip(at, values, strict=True)) for values in itertools.product(*at.values())]
 
     def tests(place: Mapping[str, Value]) -> _Tests:
-        moved = {mv: (place.get(mv, value), step) for mv, (value, step) in mvs.items()}
-        return _Tests(path, moved, cvs, dt, samples, told=told, ways=("up", "down"), **more)
+        there = {mv: (place.get(mv, value), step) for mv, (value, step) in mvs.items()}
+        return _Tests(path, there, cvs, dt, samples, told=told, ways=("up", "down"), **more)
 
     prepared = [tests(place) for place in places]  # all are checked before any is simulated
     names = [one.channel for one in prepared[0].inputs if one.variable.name in at]
@@ -165,7 +144,13 @@ class _Tests:
             self.description: FmuDescription = fmu.description
         channels = legal_names((*given, *cvs))
         self.renamed = {c: name for name, c in channels.items() if c != name}
-        self.inputs = [self._moved(channels[n], n, n in mvs, *given[n]) for n in given]
+        self.inputs: list[Moved] = []
+        for name, (value, step) in given.items():
+            option = "--mv" if name in mvs else "--dv"
+            value = self.start.get(name) if value is None else value
+            one, notes = moved(self.description, option, channels[name], name, value, step, self.ways)
+            self.inputs.append(one)
+            self.notes += notes
         self.count, self.cvs = len(mvs), [channels[name] for name in cvs]
         self.cv_variables = [self.description.variable("--cv", name) for name in cvs]
         self.block = max(samples, SETTLE_SAMPLES)
@@ -176,7 +161,7 @@ class _Tests:
             dt=self.dt,
             variables=self.renamed,
             start=self.start,
-            working_point={one.channel: _value(one.variable, one.rest) for one in self.inputs},
+            working_point={one.channel: one.variable.nearest(one.rest) for one in self.inputs},
             settle=settle,
             stop_time=(settle + LONGEST * self.block * dt) + (samples + 1) * dt,
             time_limit=time_limit,
@@ -189,65 +174,6 @@ class _Tests:
         """Say what is being done."""
         if self._told is not None:
             self._told(what)
-
-    # ------------------------------------------------------------------------------------------------ what is stepped
-
-    def _moved(self, channel: str, name: str, is_mv: bool, value: Value | None, step: float | None) -> Moved:
-        option = "--mv" if is_mv else "--dv"
-        found = self.description.variable(option, name)
-        if not found.movable or found.type not in (*REALS, *BITS, "Boolean", "Enumeration"):
-            what = f"{found.type}, {found.variability} {found.causality}"
-            raise InputError(option, name, f"an input or a tunable parameter that holds a number ({what})")
-        rest = found.number
-        own = self.start.get(name) if value is None else value
-        if own is not None:
-            rest = float(found.exactly(f"{option} {name}", own))
-        if rest is None:
-            raise InputError(f"{option} {name}", "no value", f"{found.expected}: the FMU has no start value")
-        if step is not None and not (is_number(step) and step != 0):
-            raise InputError(f"{option} {name}", step, "a step that is not zero")
-        targets = self._targets(found, rest, None if step is None else abs(step))
-        if not {"up", "down"} & set(targets):
-            expected = f"a step that stays {found.expected}, from {rest:g} up or down"
-            raise InputError(f"{option} {name}", step, expected)
-        for way, other in (("up", "down"), ("down", "up")):
-            if way not in targets:
-                self.notes.append(
-                    f"{channel} can be stepped {other} only from {rest:g}: the model is that of steps {other}"
-                )
-        return Moved(channel, found, rest, targets)
-
-    def _targets(self, v: FmuVariable, rest: float, size: float | None) -> dict[str, float]:
-        """By test, where an input is stepped to: values that it can have."""
-        if v.type == "Enumeration" and size is None:
-            above = [value for value in v.items.values() if value > rest]
-            below = [value for value in v.items.values() if value < rest]
-            found = {"up": min(above, default=None), "down": max(below, default=None)}
-            return {way: float(to) for way, to in found.items() if to is not None}
-        if size is None:
-            size = self._size(v, rest)
-        found = {}
-        for way, share in WAYS.items():
-            wanted = rest + share * size
-            to = float(v.nearest(wanted))
-            if way in self.ways and abs(to - wanted) <= 1e-9 * size and to != rest:
-                found[way] = to
-        return found
-
-    def _size(self, v: FmuVariable, rest: float) -> float:
-        """Of a step that is not given."""
-        if v.type == "Boolean":
-            return 1.0
-        low, high = v.limits
-        bounded = v.low is not None and v.high is not None
-        size = SHARE * ((high - low) if bounded else abs(rest))
-        if v.type in BITS:
-            return max(1.0, math.floor(size))
-        if not size:
-            self.notes.append(
-                f"steps of {v.name} are of 1: it stands at 0 and declares no range; give a size"
-            )
-        return size or 1.0
 
     # -------------------------------------------------------------------------------------------------------- the runs
 
@@ -262,6 +188,7 @@ class _Tests:
         with self.plant_of(0.0) as plant:
             first = plant.init().cv
             record, length, slopes = [first], self.block, []
+            movement = still = np.zeros(len(self.cvs))
             while len(record) <= LONGEST * self.block // 2:
                 self.tell(f"settling, {len(record) * self.dt:g} s simulated")
                 held = np.tile(self.rest, (length, 1))
@@ -312,7 +239,7 @@ class _Tests:
             self.tell(f"steps of {one.channel}, input {j + 1} of {len(self.inputs)}")
             counts = self._tested(plant, j, one, still.mean(axis=0), noise, settle, means)
             most = max(most, counts)
-            errors[:, j] = noise / math.sqrt(counts) * _error_of(one)
+            errors[:, j] = noise / math.sqrt(counts) * error_of(one)
         if noise.any() and most > 2:
             self.tell("runs without steps, to average the noise")
             still = np.concatenate([still, self._runs(plant, self.rest, most - 2)])
@@ -377,7 +304,7 @@ class _Tests:
         for i in np.flatnonzero(noise):
             ways = [way for way in ("up", "down") if way in one.targets]
             changes = [np.abs(np.convolve((total[w] - base)[1:, i], kernel, "valid")).max() for w in ways]
-            peak, error = max(changes), noise[i] * _error_of(one) * abs(one.targets[ways[0]] - one.rest)
+            peak, error = max(changes), noise[i] * error_of(one) * abs(one.targets[ways[0]] - one.rest)
             if peak > 5 * noise[i] / math.sqrt(smooth):
                 need = max(need, (error / (PRECISE * peak)) ** 2)
         cost = len(one.targets) * (self.samples + settle / self.dt)
@@ -398,7 +325,7 @@ class _Tests:
             "fmu": str(path),
             "fmu_hash": hashlib.sha256(path.read_bytes()).hexdigest(),
             "variables": self.renamed,
-            "start": self.start | {n: _value(self.description.variable("", n), x) for n, x in own.items()},
+            "start": self.start | {n: self.description.variable("", n).nearest(x) for n, x in own.items()},
             "settle": settle,
             "stops": self.description.experiment["stop"] is not None,
             "steps": {
@@ -410,7 +337,7 @@ class _Tests:
                 if all(map(math.isfinite, one.variable.limits)) and one.variable.type not in BITS
             },
             "actuators": {
-                one.channel: how for one in self.inputs[: self.count] if (how := _actuator(one.variable))
+                one.channel: how for one in self.inputs[: self.count] if (how := actuator_of(one.variable))
             },
         }
         count = self.count
@@ -445,40 +372,6 @@ class _Tests:
             f"{name} is called {channel} here: a process file has names of letters, digits and '_'"
             for channel, name in self.renamed.items()
         ]
-
-
-def legal_names(names: Sequence[str]) -> dict[str, str]:
-    """Names that a process file may have, by those of an FMU: ``tank[1].level`` as ``tank_1_level``."""
-    out: dict[str, str] = {}
-    for name in names:
-        plain = "_".join(re.findall(r"[A-Za-z0-9]+", name)) if re.search(r"\W", name) else name
-        plain = (plain if plain[:1].isalpha() and plain.isascii() else f"v_{plain.strip('_')}")[:60]
-        own, k = plain, 1
-        while own in out.values() or (own != name and own in names):
-            k += 1
-            own = f"{plain}_{k}"
-        out[name] = own
-    return out
-
-
-def _error_of(one: Moved) -> float:
-    """Standard error of a coefficient from runs with noise of 1 [per input unit]."""
-    shares = [1 / (one.targets[way] - one.rest) for way in ("up", "down") if way in one.targets]
-    return math.hypot(*shares, sum(shares)) / len(shares)  # of the tests, and of the run without steps
-
-
-def _value(v: FmuVariable, number: float) -> Value:
-    """A number as what its variable holds."""
-    return v.nearest(number)
-
-
-def _actuator(v: FmuVariable) -> dict | None:
-    """How an MV of this type moves, in the words of a process file."""
-    if v.type == "Boolean":
-        return {"kind": "on-off"}
-    if v.type == "Enumeration":
-        return {"kind": "values", "values": sorted(v.items.values())}
-    return {"kind": "stepped", "step": 1.0} if v.type in BITS else None
 
 
 def _movement(cv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -75,15 +76,13 @@ def _smoothed(tests: Tests) -> StepResponseModel:
         return model
     kernel = np.ones(width) / width
 
-    def smooth(s: np.ndarray) -> np.ndarray:
+    def smooth(s: Any) -> Any:
         filled = np.pad(np.asarray(s), ((0, 0), (0, 0), (width // 2, width - 1 - width // 2)), mode="edge")
-        return np.apply_along_axis(np.convolve, 2, filled, kernel, "valid") if s.size else np.asarray(s)
+        return np.apply_along_axis(np.convolve, 2, filled, kernel, "valid") if np.size(s) else s
 
-    mvs, dvs = smooth(np.asarray(model.coefficients)), smooth(np.asarray(model.dv_coefficients))
-    return StepResponseModel(
-        mvs, model.dt, model.cv_names, model.mv_names, model.cv_units, model.mv_units,
-        dv_coefficients=dvs, dv_names=model.dv_names, dv_units=model.dv_units,
-    )  # fmt: skip  # pyright: ignore[reportArgumentType]
+    return dataclasses.replace(
+        model, coefficients=smooth(model.coefficients), dv_coefficients=smooth(model.dv_coefficients)
+    )
 
 
 def _pair(tests: Tests, i: int, j: int, row: Settling) -> tuple[Verdict, str]:
@@ -113,8 +112,8 @@ def _pair(tests: Tests, i: int, j: int, row: Settling) -> tuple[Verdict, str]:
     alone = _drift(tests.base[:, i])
     if alone > CURVED * tests.changes[i, j]:
         looks.append(
-            f"without a step it moves by {alone:.3g} {cv_unit} in the same time: the response is the difference of both, which "
-            "is right where the plant is linear; let it settle longer (--settle), or look at what drives it"
+            f"without a step it moves by {alone:.3g} {cv_unit} in the same time: the response is the difference of both, "
+            "which is right where the plant is linear; let it settle longer (--settle), or look at what drives it"
         )
     verdict: Verdict = "bad" if runaway else "look" if looks else "good"
     apart, says = _sizes(tests, i, j, peak, error)
@@ -152,8 +151,8 @@ def _moving(s: np.ndarray, row: Settling, dt: float, per: str, error: float) -> 
         return False, ""
     if abs(last - before) <= CONSTANT * abs(last) + doubt:
         return False, (
-            f"it integrates: at the end it moves {last:.4g}{per} each second, for ever; the prediction holds the last value, so "
-            "control it with a horizon within the model, or take a CV that settles"
+            f"it integrates: at the end it moves {last:.4g}{per} each second, for ever; the prediction holds the last "
+            "value, so control it with a horizon within the model, or take a CV that settles"
         )
     if last * before > 0 and abs(last) > abs(before):
         if before * first > 0 and last / before > 0.9 * before / first > 0.9:
@@ -180,8 +179,8 @@ def _sizes(tests: Tests, i: int, j: int, peak: float, error: float) -> tuple[flo
         worst, says = (
             apart,
             (
-                f"a step up and one down differ by {100 * apart:.3g} %: gain {up:.4g} up, {down:.4g} down; smaller steps, or a "
-                "gain schedule (--at)"
+                f"a step up and one down differ by {100 * apart:.3g} %: gain {up:.4g} up, {down:.4g} down; smaller steps, "
+                "or a gain schedule (--at)"
             ),
         )
     if halves:
@@ -190,8 +189,8 @@ def _sizes(tests: Tests, i: int, j: int, peak: float, error: float) -> tuple[flo
             worst, says = (
                 apart,
                 (
-                    f"steps of half the size differ by {100 * apart:.3g} %: gain {float(np.mean(halves, axis=0)[-1]):.4g}; step as "
-                    "far as the controller will move it"
+                    f"steps of half the size differ by {100 * apart:.3g} %: gain {float(np.mean(halves, axis=0)[-1]):.4g}; "
+                    "step as far as the controller will move it"
                 ),
             )
     return worst, says

@@ -255,7 +255,12 @@ class Runner:
         """Begin a new run at time zero with start values, and inputs that hold from then on."""
         if self._used:
             self._begin("reset")
-            self._fmu.reset()
+            try:
+                self._fmu.reset()
+            except Exception:  # many FMUs cannot: another instance begins anew, too
+                self._begin("its second instantiation")
+                self._fmu.freeInstance()
+                self._fmu.instantiate()
         self._time, self._used, self._stop = 0.0, True, stop
         self._exchange = None
         if self.fmi == 2:

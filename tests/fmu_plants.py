@@ -2,7 +2,7 @@
 
 Their equations are snippets: `rates` sets the derivatives ``d[0..7]`` of the states ``x``, `outputs` sets ``y[0..7]`` from
 ``x``, the inputs ``u`` (reals), ``n`` (integers, enumerations), ``b`` (Booleans) and ``t``; `tick` runs at every step of 1 s
-of co-simulation; `indicators` sets ``z``, `update` runs in events and may set ``next``.
+of co-simulation; `crossings` sets the event indicators ``z``, `update` runs in events and may set ``next``.
 """
 
 import shutil
@@ -19,29 +19,50 @@ SOURCE = """
 #include <stdlib.h>
 #include <string.h>
 #include <unistd.h>
-static double u[8], x[8], y[8], z[8], now, next, past[4000], memory[8], d0[8]; static int n[4], b[4], ticks, start;
+typedef const unsigned *Refs;
+static double u[8], x[8], y[8], z[8], now, next, past[4000], memory[8], d0[8];
+static int n[4], b[4], ticks;
 static unsigned long seed = 1;
-static double noise(void) { double s = 0; for (int i = 0; i < 12; i++) { seed = seed * 6364136223846793005UL + 1442695040888963407UL;
-  s += (seed >> 11) / 9007199254740992.0; } return s - 6; }
+static double noise(void)  /* of mean 0 and variance 1 */
+{
+    double s = -6;
+    for (int i = 0; i < 12; i++) {
+        seed = seed * 6364136223846793005UL + 1442695040888963407UL; s += (seed >> 11) / 9007199254740992.0;
+    }
+    return s;
+}
 static void rates(double t, const double *x, double *d) { memset(d, 0, 8 * sizeof *d); RATES; }
 static void outputs(void) { double t = now; OUTPUTS; }
-static void clear(void) { memset(x, 0, sizeof x); memset(y, 0, sizeof y); memset(past, 0, sizeof past);
-  memset(memory, 0, sizeof memory); ticks = 0; now = 0; next = 1e300; start = 0; INITIAL; }
-#define BOTH(T, t, values) int fmi2Set##T(void *c, const unsigned *vr, size_t k, const t *v) { for (size_t i = 0; i < k; i++) { values[vr[i]] = v[i]; } return 0; } \\
-  int fmi2Get##T(void *c, const unsigned *vr, size_t k, t *v) { outputs(); for (size_t i = 0; i < k; i++) { v[i] = values[vr[i]]; } return 0; }
-BOTH(Integer, int, n) BOTH(Boolean, int, b)
-int fmi2SetReal(void *c, const unsigned *vr, size_t k, const double *v)
+static void clear(void)
+{
+    memset(x, 0, sizeof x); memset(y, 0, sizeof y); memset(past, 0, sizeof past); memset(memory, 0, sizeof memory);
+    ticks = 0; now = 0; next = 1e300; INITIAL;
+}
+#define WHOLE(T, values) \\
+    int fmi2Set##T(void *c, Refs vr, size_t k, const int *v) \\
+    { for (size_t i = 0; i < k; i++) { values[vr[i]] = v[i]; } return 0; } \\
+    int fmi2Get##T(void *c, Refs vr, size_t k, int *v) \\
+    { outputs(); for (size_t i = 0; i < k; i++) { v[i] = values[vr[i]]; } return 0; }
+WHOLE(Integer, n) WHOLE(Boolean, b)
+int fmi2SetReal(void *c, Refs vr, size_t k, const double *v)
 { for (size_t i = 0; i < k; i++) { if (vr[i] < 8) { u[vr[i]] = v[i]; } } return 0; }
-int fmi2GetReal(void *c, const unsigned *vr, size_t k, double *v)
-{ outputs(); for (size_t i = 0; i < k; i++) { unsigned r = vr[i]; rates(now, x, d0); v[i] = r < 8 ? u[r] : r < 20 ? y[r - 10] : r < 30 ? x[r - 20] : d0[r - 30]; } return 0; }
+int fmi2GetReal(void *c, Refs vr, size_t k, double *v)
+{
+    outputs(); rates(now, x, d0);
+    for (size_t i = 0; i < k; i++) {
+        unsigned r = vr[i]; v[i] = r < 8 ? u[r] : r < 20 ? y[r - 10] : r < 30 ? x[r - 20] : d0[r - 30];
+    }
+    return 0;
+}
 void *fmi2Instantiate(const char *name, int type, const char *guid) { clear(); return strcmp(guid, "{plant}") ? 0 : u; }
-int fmi2Reset(void *c) { clear(); memset(u, 0, sizeof u); memset(n, 0, sizeof n); memset(b, 0, sizeof b); return 0; }
+int fmi2Reset(void *c)
+{ RESET; clear(); memset(u, 0, sizeof u); memset(n, 0, sizeof n); memset(b, 0, sizeof b); return 0; }
 int fmi2SetupExperiment(void *c, int f, double a, double t, int known, double stop) { return 0; }
-int fmi2ExitInitializationMode(void *c) { start = 1; BEGIN; return 0; }
+int fmi2ExitInitializationMode(void *c) { BEGIN; return 0; }
 int fmi2DoStep(void *c, double t, double h)
 {
     int count = (int)(h / 0.25 + 0.5); double e = h / count, k1[8], k2[8], k3[8], k4[8], w[8];
-    for (int s = 0; s < count; s++) {
+    for (int s = 0; s < count; s++) {  /* Runge-Kutta of fourth order */
         double a = t + s * e; int i;
         rates(a, x, k1); for (i = 0; i < 8; i++) { w[i] = x[i] + e / 2 * k1[i]; }
         rates(a + e / 2, w, k2); for (i = 0; i < 8; i++) { w[i] = x[i] + e / 2 * k2[i]; }
@@ -53,15 +74,21 @@ int fmi2DoStep(void *c, double t, double h)
 int fmi2SetTime(void *c, double t) { now = t; return 0; }
 int fmi2SetContinuousStates(void *c, const double *v, size_t k) { memcpy(x, v, k * sizeof *v); return 0; }
 int fmi2GetContinuousStates(void *c, double *v, size_t k) { memcpy(v, x, k * sizeof *v); return 0; }
-int fmi2GetNominalsOfContinuousStates(void *c, double *v, size_t k) { for (size_t i = 0; i < k; i++) { v[i] = 1; } return 0; }
-int fmi2GetDerivatives(void *c, double *v, size_t k) { RATE_CALL; rates(now, x, d0); memcpy(v, d0, k * sizeof *v); return 0; }
-int fmi2GetEventIndicators(void *c, double *v, size_t k) { double t = now; INDICATORS; memcpy(v, z, k * sizeof *v); return 0; }
+int fmi2GetNominalsOfContinuousStates(void *c, double *v, size_t k)
+{ for (size_t i = 0; i < k; i++) { v[i] = 1; } return 0; }
+int fmi2GetDerivatives(void *c, double *v, size_t k)
+{ RATE_CALL; rates(now, x, d0); memcpy(v, d0, k * sizeof *v); return 0; }
+int fmi2GetEventIndicators(void *c, double *v, size_t k)
+{ double t = now; INDICATORS; memcpy(v, z, k * sizeof *v); return 0; }
 typedef struct { int needed, ends, nominals, values, defined; double when; } Info;
 int fmi2NewDiscreteStates(void *c, Info *info)
-{ double t = now; memset(info, 0, sizeof *info); UPDATE; info->defined = next < 1e299; info->when = next; return 0; }
+{
+    double t = now; memset(info, 0, sizeof *info); UPDATE;
+    info->defined = next < 1e299; info->when = next; return 0;
+}
 int fmi2CompletedIntegratorStep(void *c, int none, int *event, int *ends) { *event = *ends = 0; return 0; }
 """
-PLACES = ("RATE_CALL", "RATES", "OUTPUTS", "INITIAL", "BEGIN", "TICK", "INDICATORS", "UPDATE")
+PLACES = ("RATE_CALL", "RATES", "RESET", "OUTPUTS", "INITIAL", "BEGIN", "TICK", "INDICATORS", "UPDATE")
 
 
 def real(name: str, reference: int, causality: str = "input", **more) -> str:
@@ -99,8 +126,7 @@ def make_plant(
 
     source = SOURCE
     for place in PLACES:
-        name = {"INDICATORS": "event_indicators", "RATE_CALL": "rate_call"}.get(place, place.lower())
-        source = source.replace(place, code.pop(name, ""))
+        source = source.replace(place, code.pop({"INDICATORS": "crossings"}.get(place, place.lower()), ""))
     assert not code, code
     made = FMU2Slave if kind == "CoSimulation" else FMU2Model
     names = [name for name in dir(made) if name.startswith("fmi2")]

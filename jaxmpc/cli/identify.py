@@ -1,4 +1,4 @@
-"""``jaxmpc fmu build``, ``fmu info`` and ``identify``: the well as an FMU, what FMUs are, and a model of a process, an FMU or data."""
+"""``jaxmpc fmu build``, ``fmu info`` and ``identify``: the well as an FMU, what FMUs are, and a model of anything."""
 
 from __future__ import annotations
 
@@ -48,7 +48,8 @@ STEPPED_OPTIONS = (
     option(
         "--at",
         "MV=VALUE",
-        "process: where an MV stands before the steps, if not as it says; FMU: MV=V1,V2,..., a gain schedule over one or two MVs",
+        "process: where an MV stands before the steps, if not as it says; "
+        "FMU: MV=V1,V2,..., a gain schedule over one or two MVs",
         str,
         action="append",
     ),
@@ -77,7 +78,7 @@ KINDS = {  # of sources: what they are called, and their own options
     option(
         "source",
         "SOURCE",
-        "process file or shipped process (default: the well of the thesis), FILE.fmu, or logged data as FILE.csv or FILE.parquet",
+        "process file or shipped process (default: the well of the thesis), FILE.fmu, or logged data (.csv, .parquet)",
         str,
         nargs="?",
     ),

@@ -43,6 +43,7 @@ def identify_fmu(options: Options) -> int:
     at = {
         name: [_value(value) for value in values.split(",")]
         for name, values in _named("--at", options.at or ())
+        if values
     }
     if at and dvs:
         raise InputError("--dv", next(iter(dvs)), "none with --at: a schedule has no measured disturbances")
