@@ -85,10 +85,14 @@ class Exchange:
         """Go to a time [s] in solver steps of at most `largest` [s]."""
         if self._solver is None:
             self._solver = self._new_solver(largest)
-        while self._time < end:
-            if self._next_event <= self._time + CLOSE * max(1.0, self._time):
+        close = CLOSE * max(1.0, end)
+        while True:
+            if self._next_event <= self._time + close:
                 self._event(max(self._next_event, self._time))
                 continue
+            if self._time >= end - close:
+                self._time = max(self._time, end)  # what is left is rounding
+                return
             aim = min(end, self._next_event)
             crossed = self._integrate(self._solver, aim)
             stepped, ends = False, False

@@ -31,6 +31,7 @@ from jaxmpc.model.step_response import StepResponseModel, make_model
 
 LONGEST = 64  # times as long as a response an FMU may take to settle
 STILL = 1e-6  # of all that it has moved: it has settled
+GROWING = 1.5  # of a slope from one stretch to the next: an FMU that runs away
 PRECISE = 0.001  # of the largest coefficient: standard error that repetitions are to reach
 MOST_REPEATS = 400
 MOST_SAMPLES = 400_000  # simulated for the tests of one input
@@ -204,6 +205,15 @@ class _Tests:
                         else ((len(record) - 1) * self.dt)
                     )
                 slopes.append(movement / length)
+                if (
+                    len(slopes) > 2
+                    and (np.array(slopes[-2:]) > GROWING * np.array(slopes[-3:-1])).all(axis=0).any()
+                ):
+                    i = int(np.argmax(slopes[-1] / np.maximum(slopes[-2], 1e-300)))
+                    self.notes.append(
+                        f"{self.cvs[i]} runs away at the working point: the steps are made from the start of the FMU on"
+                    )
+                    return 0.0
                 if len(slopes) > 2 and np.allclose(slopes[-1], slopes[-2], rtol=0.01):
                     break  # it will go on like this
                 length = len(record) - 1

@@ -208,9 +208,7 @@ def advice_of(verdicts: Sequence[PairVerdict], model: StepResponseModel) -> tupl
     found = []
     bad = [f"{row.input} on {row.cv}" for row in verdicts if row.verdict == "bad"]
     if bad:
-        found.append(
-            f"Do not use {', '.join(bad)} as it is: smaller steps, another working point, or a gain schedule (--at)."
-        )
+        found.append(f"Do not use {', '.join(bad)} as it is: its verdict says why, and what to do.")
     if "would show it all" in says or "give more samples" in says:
         found.append(
             f"Give more samples than {model.samples} (--samples), or a longer sampling interval (--dt)."

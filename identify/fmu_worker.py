@@ -210,13 +210,18 @@ class Runner:
     def load(self) -> None:
         """Unpack the FMU, load its library and instantiate it."""
         described = self._described
-        kind = described.coSimulation or described.modelExchange
-        if kind is None:
+        if described.coSimulation is None and described.modelExchange is None:
             has = ", ".join(kinds_of(described)) or "nothing"
             expected = f"an FMU for co-simulation or model exchange (it has only: {has})"
             raise RefusedError(expected, "Export it once more for co-simulation")
         self._begin("the unpacking")
         unpack(self.path, self.folder)
+        self._instantiate()
+
+    def _instantiate(self) -> None:
+        """Load the library and make an instance."""
+        described = self._described
+        kind = described.coSimulation or described.modelExchange
         from fmpy.fmi2 import FMU2Model, FMU2Slave
         from fmpy.fmi3 import FMU3Model, FMU3Slave
 
@@ -258,9 +263,8 @@ class Runner:
             try:
                 self._fmu.reset()
             except Exception:  # many FMUs cannot: another instance begins anew, too
-                self._begin("its second instantiation")
                 self._fmu.freeInstance()
-                self._fmu.instantiate()
+                self._instantiate()
         self._time, self._used, self._stop = 0.0, True, stop
         self._exchange = None
         if self.fmi == 2:
