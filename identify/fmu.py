@@ -26,9 +26,14 @@ MvActuator = Actuator | tuple[float, float] | None
 
 
 def validate_fmu(path: str | Path) -> list[str]:
-    """Problems that FMPy's validator finds in an FMU; empty if there are none."""
+    """Problems that FMPy's validator finds in an FMU; empty if there are none.
+
+    Raises:
+        InputError: for a file that is no FMU of FMI 2.0 or 3.0, with the reason.
+    """
     from fmpy.validation import validate_fmu as validate
 
+    FmuProcess(path).close()
     return list(validate(str(path)))
 
 

@@ -75,7 +75,8 @@ TEST_ONLY = {
     "tests",
 }
 SOLVES = {  # figures read results: nothing that predicts, solves or simulates
-    "jaxmpc.model",
+    "jaxmpc.model.step_response",
+    "jaxmpc.model.transfer_function",
     "jaxmpc.problem.condense",
     "jaxmpc.relaxed",
     "jaxmpc.integer",
