@@ -169,10 +169,10 @@ def _record(found: Identification, record: Record, number: int) -> str:
         ax.plot(times, record.measured[::every, i], color=style.BLACK, label="measured")
         ax.plot(times, record.predicted[::every, i], color=style.ORANGE, linestyle="--", label="model alone")
         ax.set_ylabel(style.label(style.name_of(cv), cv_units[i]), fontsize=8)
-    for j, name in enumerate(names):
-        values = record.inputs[::every, j]
-        if np.ptp(values) or len(names) == 1:
-            axes[-1].plot(times, values, drawstyle="steps-post", label=f"{name} [{style.unit(units[j])}]")
+    moving = np.ptp(record.inputs, axis=0) > 0
+    for j in np.flatnonzero(moving if moving.any() else ~moving):
+        label = f"{names[j]} [{style.unit(units[j])}]"
+        axes[-1].plot(times, record.inputs[::every, j], drawstyle="steps-post", label=label)
     axes[-1].set_ylabel("inputs", fontsize=8)
     axes[-1].set_xlabel(f"time [{unit}]")
     axes[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))

@@ -35,8 +35,18 @@ def judge(process: Process, model: StepResponseModel) -> list[Finding]:
         process: checked already.
         model: of the process.
     """
-    found = [*_pairs(process, model), *_horizons(process, model), *_gains(process, model)]
+    found = [*_told(model), *_pairs(process, model), *_horizons(process, model), *_gains(process, model)]
     return [*found, *_steps(process, model), *_references(process, model)]
+
+
+def _told(model: StepResponseModel) -> list[Finding]:
+    """What the identification of the model had reservations about."""
+    rows = dict(model.provenance).get("verdicts", ())
+    return [
+        Finding("look", f"{name} on {cv}", f"{verdict} when it was identified: {says}")
+        for cv, name, verdict, says in rows
+        if verdict in ("look", "bad")
+    ]
 
 
 def _spans(process: Process) -> np.ndarray:
