@@ -101,35 +101,39 @@ def _axis(times: np.ndarray) -> tuple[np.ndarray, str]:
     return (times / 60, "min") if times[-1] - times[0] > 7200 else (times, "s")
 
 
+def _channels(found: Identification) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
+    """Names and units of the inputs, and of the CVs."""
+    model = found.model
+    mvs, dvs, cvs = (
+        list(zip(names, units or ("1",) * len(names), strict=True))
+        for names, units in (
+            (model.mv_names, model.mv_units),
+            (model.dv_names, model.dv_units),
+            (model.cv_names, model.cv_units),
+        )
+    )
+    return mvs + dvs, cvs
+
+
 @style.house_style
 def _responses(found: Identification) -> str:
     """A panel per pair: the model with its band, and the alternatives."""
     model, responses = found.model, found.responses
-    inputs = list(
-        zip(
-            (*model.mv_names, *model.dv_names),
-            (
-                *(model.mv_units or ("1",) * len(model.mv_names)),
-                *(model.dv_units or ("1",) * len(model.dv_names)),
-            ),
-            strict=True,
-        )
-    )
-    cv_units = model.cv_units or ("1",) * len(model.cv_names)
+    inputs, cvs = _channels(found)
     verdicts = {(row.cv, row.input): row.verdict for row in found.verdicts}
     times, unit = _axis(np.arange(model.samples + 1) * model.dt)
     pictures = []
-    for i, cv in enumerate(model.cv_names):
-        drawn, axes = style.grid(1, len(inputs), max(3.0 * len(inputs), 5.0) + 0.6, 2.9)
+    looks = [(colour, line) for line in ("--", ":", "-.") for colour in OTHERS]
+    width = max(3.0 * len(inputs), 5.0) + 0.6  # inch
+    for i, (cv, cv_unit) in enumerate(cvs):
+        drawn, axes = style.grid(1, len(inputs), width, 2.9)
         for j, (name, input_unit) in enumerate(inputs):
             ax, verdict = axes[0][j], verdicts.get((cv, name), "none")
             start = np.zeros(1)
-            for (words, other), colour in zip(
-                found.alternatives.items(), OTHERS * len(found.alternatives), strict=False
-            ):
+            for (words, other), (colour, line) in zip(found.alternatives.items(), looks, strict=False):
                 if np.isfinite(other[i, j]).all():
                     curve = np.concatenate([start, other[i, j]])
-                    ax.plot(times, curve, color=colour, linewidth=1.0, linestyle="--", label=words)
+                    ax.plot(times, curve, color=colour, linewidth=1.0, linestyle=line, label=words)
             s = np.concatenate([start, responses[i, j]])
             if found.bands is not None:
                 half = np.concatenate([start, found.bands[i, j]])
@@ -140,11 +144,12 @@ def _responses(found: Identification) -> str:
             ax.axhline(0.0, color=style.GREY, linewidth=0.6)
             ax.set_title(f"{name}: {verdict}", fontsize=9, color=COLOURS[verdict])
             ax.set_xlabel(f"time after the step [{unit}]")
-            ax.set_ylabel(f"[{style.unit(cv_units[i])} per {style.unit(input_unit)}]", fontsize=8)
+            ax.set_ylabel(f"[{style.unit(cv_unit)} per {style.unit(input_unit)}]", fontsize=8)
         handles = {
             text: line for ax in axes[0] for line, text in zip(*ax.get_legend_handles_labels(), strict=True)
         }
-        drawn.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(len(handles), 7))
+        columns = max(int(width / 1.5), 2)
+        drawn.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
         picture = style.image(style.png(drawn, dpi=110), f"Responses of {cv}")
         pictures.append(f"<h3>{escape(cv)}</h3><figure>{picture}</figure>")
     return "".join(pictures)
@@ -153,25 +158,19 @@ def _responses(found: Identification) -> str:
 @style.house_style
 def _record(found: Identification, record: Record, number: int) -> str:
     """Measured and predicted CVs above the inputs that move; what the model has not seen is shaded."""
-    model = found.model
-    names = (*model.mv_names, *model.dv_names)
-    units = (
-        *(model.mv_units or ("1",) * len(model.mv_names)),
-        *(model.dv_units or ("1",) * len(model.dv_names)),
-    )
-    cv_units = model.cv_units or ("1",) * len(model.cv_names)
+    inputs, cvs = _channels(found)
     every = -(-len(record.times) // POINTS)
     times, unit = _axis(record.times[::every])
-    drawn, axes = style.figure(len(model.cv_names) + 1, row_height=1.5)
+    drawn, axes = style.figure(len(cvs) + 1, row_height=1.5)
     unseen = ~record.used[::every]
-    for i, cv in enumerate(model.cv_names):
+    for i, (cv, cv_unit) in enumerate(cvs):
         ax = axes[i]
         ax.plot(times, record.measured[::every, i], color=style.BLACK, label="measured")
         ax.plot(times, record.predicted[::every, i], color=style.ORANGE, linestyle="--", label="model alone")
-        ax.set_ylabel(style.label(style.name_of(cv), cv_units[i]), fontsize=8)
+        ax.set_ylabel(style.label(style.name_of(cv), cv_unit), fontsize=8)
     moving = np.ptp(record.inputs, axis=0) > 0
     for j in np.flatnonzero(moving if moving.any() else ~moving):
-        label = f"{names[j]} [{style.unit(units[j])}]"
+        label = f"{inputs[j][0]} [{style.unit(inputs[j][1])}]"
         axes[-1].plot(times, record.inputs[::every, j], drawstyle="steps-post", label=label)
     axes[-1].set_ylabel("inputs", fontsize=8)
     axes[-1].set_xlabel(f"time [{unit}]")

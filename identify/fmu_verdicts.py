@@ -16,6 +16,7 @@ from jaxtyping import Float
 from identify.step_test import Settling, response_words, settling
 from jaxmpc.model.identification import PairVerdict, Verdict
 from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.process.process import amount
 
 NOTHING = 1e-7  # of the largest value of a CV: a change that is no response
 CURVED, BENT = (
@@ -112,7 +113,7 @@ def _pair(tests: Tests, i: int, j: int, row: Settling) -> tuple[Verdict, str]:
     alone = _drift(tests.base[:, i])
     if alone > CURVED * tests.changes[i, j]:
         looks.append(
-            f"without a step it moves by {alone:.3g} {cv_unit} in the same time: the response is the difference of both, "
+            f"without a step it moves by {amount(alone, cv_unit)} in the same time: the response is the difference of both, "
             "which is right where the plant is linear; let it settle longer (--settle), or look at what drives it"
         )
     verdict: Verdict = "bad" if runaway else "look" if looks else "good"

@@ -21,9 +21,10 @@ def identification(records=2, **more):
     one = Record(
         "March", 10.0 * np.arange(N + 1), np.ones((N + 1, 3)), measured, np.append(0, S)[:, None], used
     )
-    verdicts = tuple(
-        PairVerdict("level", name, verdict, f"why {name}")
-        for name, verdict in (("valve", "good"), ("<pump>", "none"), ("feed", "bad"))
+    verdicts = (
+        PairVerdict("level", "valve", "good", "why valve"),
+        PairVerdict("level", "<pump>", "none", "why not"),
+        PairVerdict("level", "feed", "bad", "why feed"),
     )
     given = {
         "bands": 0.1 * np.ones((1, 3, N)),
