@@ -26,7 +26,7 @@ WORDS = {
     "none": "no response",
 }
 OTHERS = (style.ORANGE, style.SKY, style.PURPLE, style.GREEN, style.VERMILLION, style.BLACK)
-MOST_RECORDS = 24  # drawn; a page is to be read
+MOST_RECORDS, MOST_PANELS = 24, 120  # drawn; a page is to be read
 POINTS = 4000  # of a curve
 
 
@@ -50,7 +50,7 @@ def write_page(found: Identification, path: str | Path) -> Path:
         ("next", "What to do next", _listed(found.advice)),
     ]
     sections += [("responses", "Responses to a step of one unit", _responses(found))]
-    shown = found.records[:MOST_RECORDS]
+    shown = found.records[: max(min(MOST_RECORDS, MOST_PANELS // (len(model.cv_names) + 1)), 1)]
     if shown:
         parts = [_record(found, record, number) for number, record in enumerate(shown, 1)]
         left = len(found.records) - len(shown)

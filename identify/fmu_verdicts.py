@@ -24,7 +24,7 @@ CURVED, BENT = (
     0.5,
 )  # of a response: differences of its tests from which on to look, and not to use the mean
 CONSTANT = 0.02  # of a slope: two that are one
-LEFT = 0.005  # of a response: error by noise from which on to look
+LEFT = 0.003  # of a response: 95 % error of a coefficient by noise from which on to look
 FAST = 3  # samples to 63 % of a gain
 
 

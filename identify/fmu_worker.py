@@ -357,6 +357,11 @@ class Runner:
                 raise RuntimeError(f"{error}{self._beyond()}") from None
             self._time = end
 
+    def sample(self, dt: float, count: int, names: list[str]) -> list[Any]:
+        """Step and read."""
+        self.step(dt, count)
+        return self.get(names)
+
     def _beyond(self) -> str:
         """What may be the reason for a failed step: some FMUs end where their default experiment does, if not told when."""
         end = _number(getattr(self._described.defaultExperiment, "stopTime", None))
@@ -383,7 +388,7 @@ class Runner:
         return groups
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Do what is asked, in the order load, start, set, step, get."""
+        """Do what is asked, in the order load, start, set, step or hold, get."""
         try:
             if "describe" in request:
                 return self.describe(request["describe"])
@@ -395,6 +400,9 @@ class Runner:
                 self.start(*request["start"])
             if "set" in request:
                 self.change(request["set"])
+            if "hold" in request:
+                dt, count, samples = request["hold"]
+                return {"rows": [self.sample(dt, count, request["get"]) for _ in range(samples)]}
             if "step" in request:
                 self.step(*request["step"])
             return {"values": self.get(request["get"])} if "get" in request else {}

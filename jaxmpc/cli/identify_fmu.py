@@ -71,8 +71,10 @@ def identify_fmu(options: Options) -> int:
         raise InputError(field, error.value, error.expected, error.hint) from None
     if swept is not None:
         found = _with_sweep(found, swept)
+    status = written(found, out, page, *([schedule] if at else []))
+    if swept is not None:
         swept.save(schedule)
-    return written(found, out, page, *([schedule] if at else []))
+    return status
 
 
 def written(found: Any, out: Path, page: Path, *more: Path) -> int:
@@ -81,8 +83,8 @@ def written(found: Any, out: Path, page: Path, *more: Path) -> int:
 
     following = f"jaxmpc process new --model {out}"
     found = dataclasses.replace(found, advice=(*found.advice, f"Make a process of it: {following}"))
+    write_page(found, page)  # the one that may be refused, for its size
     found.model.save(out)
-    write_page(found, page)
     wide = max(len(f"{row.input} on {row.cv}") for row in found.verdicts)
     for row in found.verdicts:
         print(f"{row.verdict:<6}{f'{row.input} on {row.cv}':<{wide}}  {row.says}")
