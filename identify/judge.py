@@ -41,10 +41,9 @@ def judge(process: Process, model: StepResponseModel) -> list[Finding]:
 
 def _told(model: StepResponseModel) -> list[Finding]:
     """What the identification of the model had reservations about."""
-    rows = dict(model.provenance).get("verdicts", ())
     return [
         Finding("look", f"{name} on {cv}", f"{verdict} when it was identified: {says}")
-        for cv, name, verdict, says in rows
+        for cv, name, verdict, says in dict(model.provenance).get("verdicts", ())
         if verdict in ("look", "bad")
     ]
 

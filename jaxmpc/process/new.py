@@ -54,7 +54,8 @@ def new_process(
         *switches,
         *(mv for mv, how in moved.items() if how["kind"] == "on-off" and mv not in switches),
     )
-    steps = {mv: how["step"] for mv, how in moved.items() if how["kind"] == "stepped"} | dict(steps or {})
+    own = {mv: how["step"] for mv, how in moved.items() if how["kind"] == "stepped" and mv not in switches}
+    steps = own | dict(steps or {})
     _check(model, steps, switches)
     point = dict(model.working_point)
     cv_units, mv_units = (units or ("1",) * len(names) for units, names in _names(model))
@@ -77,12 +78,12 @@ def new_process(
         guesses.append(
             "the working point: the model has none, so that all CVs and MVs are deviations from it"
         )
-    guesses += [
-        (f"of {mv}, with a range from" if mv in known else f"the range of {mv}:")
-        + f" {low:g} to {amount(high, unit)}"
-        + (", one or the other" if mv in switches else f", and at most {moves[mv]:g} per sample")
-        for (mv, (low, high)), unit in zip(ranges.items(), mv_units, strict=True)
-    ]
+    for (mv, (low, high)), unit in zip(ranges.items(), mv_units, strict=True):
+        if mv not in known:
+            how = ", one or the other" if mv in switches else f", and at most {moves[mv]:g} per sample"
+            guesses.append(f"the range of {mv}: {low:g} to {amount(high, unit)}{how}")
+        elif mv not in switches:
+            guesses.append(f"the largest move of {mv}: {amount(moves[mv], unit)} per sample")
     guesses += [
         f"the span of {cv}: {amount(span, unit)}, by what the MVs do to it"
         for cv, span, unit in zip(model.cv_names, cv_spans, cv_units, strict=True)
