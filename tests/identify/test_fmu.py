@@ -159,6 +159,16 @@ def test_an_fmu_that_ends_with_its_default_experiment_says_so_and_goes_on_when_i
         assert [plant.step([0.0]).cv for _ in range(10)][-1] == 40.0
 
 
+def test_held_demands_give_what_as_many_steps_give(path):
+    with FmuPlant(path, {"u": (0.0, 10.0), "n": None}, ["level", "steps"], dt=10.0) as plant:
+        plant.init()
+        stepped = [plant.step([12.0, 1.4]).cv.tolist() for _ in range(5)]
+        plant.init()
+        assert plant.hold([12.0, 1.4], 2).tolist() == stepped[:2]
+        assert plant.hold([12.0, 1.4], 3).tolist() == stepped[2:]
+        assert plant.measure().mv.tolist() == [10, 1]
+
+
 # -------------------------------------------------------------------------------------------------- what is refused
 
 

@@ -64,3 +64,29 @@ def test_names_and_steps_that_no_process_could_have_are_refused(field, of, more)
     with pytest.raises(InputError) as caught:
         made(model(**of), **more)
     assert caught.value.field == field
+
+
+def test_what_an_fmu_says_of_its_inputs_is_taken_and_the_fmu_is_the_first_plant():
+    provenance = {
+        "actuators": {"valve": {"kind": "values", "values": [0, 1, 4]}, "pump": {"kind": "on-off"}},
+        "ranges": {"valve": [0, 4], "pump": [0, 1]},
+        "variables": {"flow": "line[1].flow"},
+        "start": {"mode": "auto", "open": True, "size": 2},
+        "settle": 600.0,
+        "stops": True,
+    }
+    process, guesses = made(
+        model(provenance=provenance, working_point={"valve": 1, "pump": 0}), fmu="plants/mine.fmu"
+    )
+    assert [(name, plant.kind, plant.source) for name, plant in process.plants.items()] == [
+        ("fmu", "fmu", "plants/mine.fmu"),
+        ("model", "model", ""),
+    ]
+    options = process.plants["fmu"].options
+    assert options["start"] == {"mode": "auto", "open": True, "size": 2}
+    assert options["variables"] == {"flow": "line[1].flow"}
+    assert options["working_point"] == {"valve": 1, "pump": 0}
+    assert (options["settle"], options["stop_time"]) == (600, 1e7)
+    assert [mv.actuator.listed for mv in process.mvs] == [(0.0, 1.0, 4.0), (0.0, 1.0)]
+    assert process.disturbance_names == ()
+    assert not any("the range of" in guess for guess in guesses)
