@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import itertools
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from identify.logged.fit import Data, Fit, bands, fitted, make_data, residuals, search, simulated
+from identify.logged.fit import Data, Fit, bands, climbing, fitted, make_data, residuals, search, simulated
 from identify.logged.judge import excitations, verdict_of
 from identify.logged.log import Log, read_log
 from identify.logged.low_order import LowOrder, low_order
@@ -26,9 +27,10 @@ from jaxmpc.model.identification import Identification, PairVerdict, Record
 from jaxmpc.model.step_response import make_model
 
 HELD_OUT = 0.27  # share of the samples that the first fit does not see
-LONGEST, COLUMNS = 240, 600  # lags of a first fit where N is not given: of one input, of all together
+TRIED, COLUMNS = (32, 64, 128, 192), 600  # lags of first fits where N is not given; most of all inputs together
+ROOM = 0.7  # of the lags of a first fit, in which it settles
 MARGIN, SHORTEST = 1.25, 10  # N over the settling time of the first fit; least N
-SETTLED = 0.03  # of the largest coefficient
+SETTLED, LAGS = 0.003, 5.8  # of the largest coefficient: settled; so many lags of a first order
 WHITE = 0.001  # probability below which residuals are not white
 
 
@@ -117,26 +119,44 @@ def identify_log(
 
 
 def _length(all_data: dict[str, Data], cut: int, log: Log, bar: tqdm, notes: list[str]) -> int:
-    """N by the slowest response of a first, longer fit."""
+    """N by the slowest response of first fits, which become longer until all settle well before they end."""
     inputs = next(iter(all_data.values())).inputs.shape[1]
     longest = max(own.stop - own.start for own in log.segments)
-    length = max(SHORTEST, min(LONGEST, COLUMNS // inputs, longest // 4))
-    length = min(length, longest - 2)
-    slowest = 0
-    for data in all_data.values():
-        fit = search(data.until(cut), length)
-        steps, doubt = fit.steps(data), bands(data, fit)
-        known = np.abs(steps).max(axis=1) > doubt.max(axis=1)
-        limit = SETTLED * np.abs(steps).max(axis=1, keepdims=True) + 0.5 * doubt
-        outside = (np.abs(steps - steps[:, -1:]) > limit)[known]
-        slowest = max(slowest, *(int(np.flatnonzero(row)[-1]) + 2 if row.any() else 1 for row in outside), 1)
-        bar.update()
-    samples = min(length, max(SHORTEST, int(np.ceil(MARGIN * slowest)) + 1))
-    if slowest > 0.9 * length:
+    most = min(longest - 2, max(SHORTEST, min(COLUMNS // inputs, longest // 2)))
+    tried = [*(length for length in TRIED if length < most), most]
+    slowest, length, waiting = 0, most, list(all_data.values())
+    for length in tried:
+        while waiting:
+            settled = _settled(waiting[0].until(cut), length)
+            if settled > ROOM * length and length < most:
+                break  # the others can wait for a longer one
+            slowest = max(slowest, settled)
+            waiting.pop(0)
+            bar.update()
+        if not waiting:
+            break
+    samples = min(most, max(SHORTEST, int(np.ceil(MARGIN * slowest)) + 1))
+    if slowest > 0.9 * most:
         notes.append(f"N = {samples}, all that could be tried; a response may be slower: try a larger --dt")
     else:
         notes.append(f"N = {samples} samples ({samples * log.dt:g} s): a first fit settles in {slowest * log.dt:g} s")
     return samples
+
+
+def _settled(data: Data, length: int) -> int:
+    """Samples after which the responses of a CV stay where they end, as far as the data tell."""
+    fit = search(data, length)
+    steps, doubt = fit.steps(data), bands(data, fit)
+    known = np.abs(steps).max(axis=1) > doubt.max(axis=1)
+    slowest = 1.0
+    for s, band in zip(steps[known], doubt[known], strict=True):
+        low = low_order(s, band, integrating=fit.integrating)
+        slowest = max(slowest, low.dead_time + LAGS * low.lag)  # noise hides where a response ends, not how fast it is
+        if fit.integrating:  # its rate settles
+            s, band = np.diff(s, prepend=0.0), np.abs(np.diff(band, prepend=0.0))
+        outside = np.abs(s - s[-1]) > SETTLED * np.abs(s).max() + 0.5 * band
+        slowest = max(slowest, float(np.flatnonzero(outside)[-1]) + 2 if outside.any() else 1.0)
+    return min(length, int(np.ceil(slowest)))
 
 
 def _identified(data: Data, length: int, cut: int, signals: np.ndarray, moving: np.ndarray, bar: tqdm) -> _Cv:
@@ -153,24 +173,20 @@ def _identified(data: Data, length: int, cut: int, signals: np.ndarray, moving: 
     rough = _replaced(trained, data, bands(training, trained))
     errors = np.concatenate([innovations(final.noise, left) for left in residuals(data, final)])
     every = np.full(len(data.output), np.nan)
-    mean = np.zeros(len(every))
     for own, part in zip(data.segments, np.split(errors, [own.stop for own in data.segments][:-1]), strict=True):
         every[own] = part
     low: list[LowOrder | None] = [
         low_order(s, b, integrating=final.integrating) if m else None
         for s, b, m in zip(steps, band, moving, strict=True)
     ]
-    scaled = examined(every, signals, data.segments, length)
-    del mean
+    tested = examined(every, signals, data.segments, length)
     return _Cv(
-        data, trained, final, _fit(data, alone, cut), _fit(data, whole(rough), cut), low, steps, band, alone, scaled
+        data, trained, final, _fit(data, alone, cut), _fit(data, whole(rough), cut), low, steps, band, alone, tested
     )
 
 
 def _replaced(fit: Fit, data: Data, band: np.ndarray) -> Fit:
     """The fit with low-order responses in place of its own."""
-    import dataclasses
-
     length = fit.posterior.mean.shape[1]
     shapes = fit.steps(data)
     made = [low_order(s, b, integrating=fit.integrating).response(length) for s, b in zip(shapes, band, strict=True)]
@@ -183,6 +199,8 @@ def _fit(data: Data, predicted: np.ndarray, cut: int) -> float:
     total, off = 0.0, 0.0
     for own in data.segments:
         at = slice(max(own.start, cut), own.stop)
+        if own.stop <= cut or not np.ptp(data.inputs[at], axis=0).any():
+            continue
         y, p = data.output[at], predicted[at]
         known = np.isfinite(y)
         if known.any():
@@ -194,7 +212,7 @@ def _fit(data: Data, predicted: np.ndarray, cut: int) -> float:
 def _verdict(cv: str, log: Log, name: str, excited, found: _Cv, j: int) -> PairVerdict:
     doubts, tested = [], found.tested
     s, unit = found.steps[j], log.units.get(cv, "")
-    if found.final.integrating:
+    if found.final.integrating and climbing(s[None])[0]:
         slope = (s[-1] - s[-max(2, len(s) // 5)]) / (max(2, len(s) // 5) - 1) / log.dt
         doubts.append(f"integrates: still rises by {slope:.3g} {unit} per second at sample {len(s)}, where the model holds it")
     elif _unsettled(s, found.band[j]):
@@ -222,9 +240,13 @@ def _method_notes(log: Log, found: dict[str, _Cv], inputs: Sequence[str], sample
         "before each segment the inputs were taken to have stood at their first values",
     ]
     for name, own in found.items():
-        better = "predicts it better" if own.low_fit > own.fit else "predicts it less well"
-        words = f"{name}: {own.fit:.1f} % of the part that was left out is predicted (its level is not: one offset was fitted); "
-        notes.append(words + f"first order and dead time {better} ({own.low_fit:.1f} %)")
+        if np.isnan(own.fit):
+            notes.append(f"{name}: no input moves in the part that was left out, which therefore judges nothing")
+        else:
+            off = own.low_fit - own.fit
+            better = "as well" if abs(off) < 0.5 else "better" if off > 0 else "less well"
+            words = f"{name}: {own.fit:.1f} % of the part that was left out is predicted (its level is not: one offset was "
+            notes.append(f"{words}fitted); first order and dead time predict it {better} ({own.low_fit:.1f} %)")
         words = f"{name}: the noise is {own.final.noise}"
         if own.final.free is not None:
             words += "; segments do not begin at rest, so that a free response was fitted at each beginning"

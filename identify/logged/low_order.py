@@ -30,15 +30,21 @@ def _shape(length: int, lag: np.ndarray, dead: np.ndarray, integrating: bool) ->
 
 
 def low_order(
-    steps: Float[np.ndarray, " n"], band: Float[np.ndarray, " n"], *, integrating: bool
+    steps: Float[np.ndarray, " n"], band: Float[np.ndarray, " n"], *, integrating: bool = False
 ) -> LowOrder:
     """The best one for a step response, by least squares over a grid of lag and dead time that closes in.
 
     Args:
         steps: S(1)..S(N).
         band: half widths, which weigh the coefficients; 2 % of the largest coefficient at least.
-        integrating: whether it ends in a ramp.
+        integrating: whether a ramp is tried too.
     """
+    found = [_searched(steps, band, ramp) for ramp in ((False, True) if integrating else (False,))]
+    return min(found)[1]
+
+
+def _searched(steps: np.ndarray, band: np.ndarray, integrating: bool) -> tuple[float, LowOrder]:
+    """The best of one kind, and its sum of squares."""
     length = len(steps)
     weight = 1 / (np.nan_to_num(band) + 0.02 * max(np.abs(steps).max(), 1e-300))
     lags, deads = (np.log(0.05), np.log(length)), (0.0, 0.6 * length)
@@ -53,4 +59,4 @@ def low_order(
         reach = (lags[1] - lags[0]) / POINTS * 2, (deads[1] - deads[0]) / POINTS * 2
         lags = np.log(best[2]) - reach[0], np.log(best[2]) + reach[0]
         deads = max(0.0, best[3] - reach[1]), best[3] + reach[1]
-    return LowOrder(*best[1:], integrating)
+    return best[0], LowOrder(*best[1:], integrating)
