@@ -55,8 +55,10 @@ class Data:
         total = np.tril(np.ones((length, length)))
         if integrating:
             total = total @ total / self._sum_scale[:, None, None]
-        return self.output_scale / self.input_scale[:, None, None] * np.broadcast_to(
-            total, (len(self.input_scale), length, length)
+        return (
+            self.output_scale
+            / self.input_scale[:, None, None]
+            * np.broadcast_to(total, (len(self.input_scale), length, length))
         )
 
 
@@ -190,7 +192,9 @@ def bands(data: Data, fit: Fit) -> Float[np.ndarray, "input n"]:
     parameters = fit.posterior.parameters.copy()
     length = fit.posterior.mean.shape[1]
     size, tau, kappa = np.exp(parameters.T)
-    weak = fit.posterior.variance * size * np.minimum(tau, length) * np.minimum(kappa, length) < LEAST_PRIOR**2
+    weak = (
+        fit.posterior.variance * size * np.minimum(tau, length) * np.minimum(kappa, length) < LEAST_PRIOR**2
+    )
     slow = length / 5
     parameters[weak, 1], parameters[weak, 2] = np.log(slow), np.log(2 * slow)
     parameters[weak, 0] = 2 * np.log(LEAST_PRIOR / slow) - np.log(max(fit.posterior.variance, 1e-12))

@@ -27,7 +27,10 @@ from jaxmpc.model.identification import Identification, PairVerdict, Record
 from jaxmpc.model.step_response import make_model
 
 HELD_OUT = 0.27  # share of the samples that the first fit does not see
-TRIED, COLUMNS = (32, 64, 128, 192), 600  # lags of first fits where N is not given; most of all inputs together
+TRIED, COLUMNS = (
+    (32, 64, 128, 192),
+    600,
+)  # lags of first fits where N is not given; most of all inputs together
 ROOM = 0.7  # of the lags of a first fit, in which it settles
 MARGIN, SHORTEST = 1.25, 10  # N over the settling time of the first fit; least N
 SETTLED, LAGS = 0.003, 5.8  # of the largest coefficient: settled; so many lags of a first order
@@ -93,12 +96,16 @@ def identify_log(
     cut = int(round((1 - HELD_OUT) * len(log.times)))
     all_data = {name: make_data(log.values[name], signals[:, moving], log.segments) for name in cv}
     notes = list(log.notes)
-    with tqdm(total=len(cv) * (3 if samples is None else 2), desc="identify", delay=2, disable=not progress) as bar:
+    with tqdm(
+        total=len(cv) * (3 if samples is None else 2), desc="identify", delay=2, disable=not progress
+    ) as bar:
         if samples is None:
             samples = _length(all_data, cut, log, bar, notes)
         elif samples > max(own.stop - own.start for own in log.segments) - 2:
             raise InputError("--samples", samples, "fewer samples than the longest segment of the log has")
-        found = {name: _identified(data, samples, cut, signals, moving, bar) for name, data in all_data.items()}
+        found = {
+            name: _identified(data, samples, cut, signals, moving, bar) for name, data in all_data.items()
+        }
     excited = excitations(inputs, [log.units.get(name, "") for name in inputs], signals, log.segments)
     verdicts = tuple(
         _verdict(name, log, inputs[j], excited[j], found[name], j) for name in cv for j in range(len(inputs))
@@ -139,7 +146,9 @@ def _length(all_data: dict[str, Data], cut: int, log: Log, bar: tqdm, notes: lis
     if slowest > 0.9 * most:
         notes.append(f"N = {samples}, all that could be tried; a response may be slower: try a larger --dt")
     else:
-        notes.append(f"N = {samples} samples ({samples * log.dt:g} s): a first fit settles in {slowest * log.dt:g} s")
+        notes.append(
+            f"N = {samples} samples ({samples * log.dt:g} s): a first fit settles in {slowest * log.dt:g} s"
+        )
     return samples
 
 
@@ -151,7 +160,9 @@ def _settled(data: Data, length: int) -> int:
     slowest = 1.0
     for s, band in zip(steps[known], doubt[known], strict=True):
         low = low_order(s, band, integrating=fit.integrating)
-        slowest = max(slowest, low.dead_time + LAGS * low.lag)  # noise hides where a response ends, not how fast it is
+        slowest = max(
+            slowest, low.dead_time + LAGS * low.lag
+        )  # noise hides where a response ends, not how fast it is
         if fit.integrating:  # its rate settles
             s, band = np.diff(s, prepend=0.0), np.abs(np.diff(band, prepend=0.0))
         outside = np.abs(s - s[-1]) > SETTLED * np.abs(s).max() + 0.5 * band
@@ -173,7 +184,9 @@ def _identified(data: Data, length: int, cut: int, signals: np.ndarray, moving: 
     rough = _replaced(trained, data, bands(training, trained))
     errors = np.concatenate([innovations(final.noise, left) for left in residuals(data, final)])
     every = np.full(len(data.output), np.nan)
-    for own, part in zip(data.segments, np.split(errors, [own.stop for own in data.segments][:-1]), strict=True):
+    for own, part in zip(
+        data.segments, np.split(errors, [own.stop for own in data.segments][:-1]), strict=True
+    ):
         every[own] = part
     low: list[LowOrder | None] = [
         low_order(s, b, integrating=final.integrating) if m else None
@@ -181,7 +194,16 @@ def _identified(data: Data, length: int, cut: int, signals: np.ndarray, moving: 
     ]
     tested = examined(every, signals, data.segments, length)
     return _Cv(
-        data, trained, final, _fit(data, alone, cut), _fit(data, whole(rough), cut), low, steps, band, alone, tested
+        data,
+        trained,
+        final,
+        _fit(data, alone, cut),
+        _fit(data, whole(rough), cut),
+        low,
+        steps,
+        band,
+        alone,
+        tested,
     )
 
 
@@ -189,7 +211,10 @@ def _replaced(fit: Fit, data: Data, band: np.ndarray) -> Fit:
     """The fit with low-order responses in place of its own."""
     length = fit.posterior.mean.shape[1]
     shapes = fit.steps(data)
-    made = [low_order(s, b, integrating=fit.integrating).response(length) for s, b in zip(shapes, band, strict=True)]
+    made = [
+        low_order(s, b, integrating=fit.integrating).response(length)
+        for s, b in zip(shapes, band, strict=True)
+    ]
     impulse = np.linalg.solve(data.to_steps(fit.integrating, length), np.array(made)[:, :, None])[:, :, 0]
     return dataclasses.replace(fit, posterior=dataclasses.replace(fit.posterior, mean=impulse))
 
@@ -214,15 +239,21 @@ def _verdict(cv: str, log: Log, name: str, excited, found: _Cv, j: int) -> PairV
     s, unit = found.steps[j], log.units.get(cv, "")
     if found.final.integrating and climbing(s[None])[0]:
         slope = (s[-1] - s[-max(2, len(s) // 5)]) / (max(2, len(s) // 5) - 1) / log.dt
-        doubts.append(f"integrates: still rises by {slope:.3g} {unit} per second at sample {len(s)}, where the model holds it")
+        doubts.append(
+            f"integrates: still rises by {slope:.3g} {unit} per second at sample {len(s)}, where the model holds it"
+        )
     elif _unsettled(s, found.band[j]):
         doubts.append(f"has not settled by sample {len(s)}: more --samples, or a larger --dt")
     if tested.past[j] > tested.limit:
-        doubts.append(f"residuals still follow moves of {name} (correlation {tested.past[j]:.2f}): slower or not linear")
+        doubts.append(
+            f"residuals still follow moves of {name} (correlation {tested.past[j]:.2f}): slower or not linear"
+        )
     if tested.feedback[j] > tested.limit:
         doubts.append(f"{name} follows what disturbs {cv} (feedback, correlation {tested.feedback[j]:.2f})")
     values = log.values[cv]
-    span = float(np.nanpercentile(values, 99) - np.nanpercentile(values, 1)) or float(np.nanmax(values) - np.nanmin(values))
+    span = float(np.nanpercentile(values, 99) - np.nanpercentile(values, 1)) or float(
+        np.nanmax(values) - np.nanmin(values)
+    )
     return verdict_of(cv, unit, span, name, excited, s, found.band[j], doubts)
 
 
@@ -232,7 +263,9 @@ def _unsettled(steps: np.ndarray, band: np.ndarray) -> bool:
     return moved > 0.03 * np.abs(steps).max() and moved > 0.5 * float(np.nanmax(band))
 
 
-def _method_notes(log: Log, found: dict[str, _Cv], inputs: Sequence[str], samples: int, cut: int) -> list[str]:
+def _method_notes(
+    log: Log, found: dict[str, _Cv], inputs: Sequence[str], samples: int, cut: int
+) -> list[str]:
     kept = len(log.times) - cut
     notes = [
         f"the first {cut} samples made a first model, which was judged on the last {kept}; then all made the model in the file, "
@@ -241,12 +274,16 @@ def _method_notes(log: Log, found: dict[str, _Cv], inputs: Sequence[str], sample
     ]
     for name, own in found.items():
         if np.isnan(own.fit):
-            notes.append(f"{name}: no input moves in the part that was left out, which therefore judges nothing")
+            notes.append(
+                f"{name}: no input moves in the part that was left out, which therefore judges nothing"
+            )
         else:
             off = own.low_fit - own.fit
             better = "as well" if abs(off) < 0.5 else "better" if off > 0 else "less well"
             words = f"{name}: {own.fit:.1f} % of the part that was left out is predicted (its level is not: one offset was "
-            notes.append(f"{words}fitted); first order and dead time predict it {better} ({own.low_fit:.1f} %)")
+            notes.append(
+                f"{words}fitted); first order and dead time predict it {better} ({own.low_fit:.1f} %)"
+            )
         words = f"{name}: the noise is {own.final.noise}"
         if own.final.free is not None:
             words += "; segments do not begin at rest, so that a free response was fitted at each beginning"
@@ -258,7 +295,10 @@ def _method_notes(log: Log, found: dict[str, _Cv], inputs: Sequence[str], sample
         if fed:
             names = ", ".join(inputs[j] for j in fed)
             words = f"{name}: {names} follow its residuals: a controller or an operator closed the loop while this was logged, "
-            notes.append(words + "and with feedback the responses may be biased; moves that do not depend on it tell more")
+            notes.append(
+                words
+                + "and with feedback the responses may be biased; moves that do not depend on it tell more"
+            )
     return notes
 
 
@@ -267,9 +307,13 @@ def _advice(verdicts: Sequence[PairVerdict], log: Log, samples: int) -> tuple[st
     bad = list(dict.fromkeys(row.input for row in verdicts if row.verdict == "bad"))
     if bad:
         length = samples * log.dt
-        out.append(f"Step {', '.join(bad)}, one at a time, up and down, some steps held for {length:g} s, and identify again")
+        out.append(
+            f"Step {', '.join(bad)}, one at a time, up and down, some steps held for {length:g} s, and identify again"
+        )
     if any(row.verdict == "look" for row in verdicts):
-        out.append("Look at the responses with the verdict look, and at the predictions, before you use the model")
+        out.append(
+            "Look at the responses with the verdict look, and at the predictions, before you use the model"
+        )
     return tuple(out)
 
 
@@ -282,7 +326,7 @@ def _model(path, log: Log, mv, cv, dv, found: dict[str, _Cv], samples: int, verd
         "method": "kernel-based regularised least squares on logged data",
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "begin": log.begin,
-        "samples_used": int(len(log.times)),
+        "samples_used": len(log.times),
         "fit": {name: round(float(found[name].fit), 2) for name in cv},
         "verdicts": [list(row) for row in verdicts],
         "notes": list(notes),
@@ -308,7 +352,9 @@ def _alternative(found: dict[str, _Cv], cv: Sequence[str], samples: int) -> np.n
     )
 
 
-def _record(path, log: Log, cv: Sequence[str], signals: np.ndarray, found: dict[str, _Cv], cut: int) -> Record:
+def _record(
+    path, log: Log, cv: Sequence[str], signals: np.ndarray, found: dict[str, _Cv], cut: int
+) -> Record:
     measured = np.stack([log.values[name] for name in cv], axis=1)
     predicted = np.full_like(measured, np.nan)
     for (i, name), own in itertools.product(enumerate(cv), log.segments):

@@ -115,4 +115,3 @@ def verdict_of(
         verdict = "look"
         words.append(f"{name} moves much like {excited.other} ({100 * excited.alike:.3g} %)")
     return PairVerdict(cv, name, verdict, "; ".join([*words, *doubts]))
-

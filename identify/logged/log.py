@@ -99,7 +99,9 @@ def read_log(
     if dt is None:
         dt = float(f"{typical:.6g}")
         notes.append(f"the sampling interval is the median of the log's, {dt:g} s")
-    pieces = np.split(np.arange(len(stamps)), np.flatnonzero(np.diff(stamps) > GAP * max(typical, dt / GAP)) + 1)
+    pieces = np.split(
+        np.arange(len(stamps)), np.flatnonzero(np.diff(stamps) > GAP * max(typical, dt / GAP)) + 1
+    )
     _tell_of_intervals(stamps, typical, dt, pieces, notes)
     return _on_grid(table, pieces, typical, dt, held, notes)
 
@@ -129,7 +131,9 @@ def _cleaned(name: str, values: np.ndarray, notes: list[str]) -> np.ndarray:
     if len(x) < LEAST:
         return values
     changes = np.abs(np.diff(x))
-    limit = max(SPIKE * 1.4826 * np.median(changes), SPIKE_SHARE * float(np.diff(np.percentile(x, [1, 99]))[0]))
+    limit = max(
+        SPIKE * 1.4826 * np.median(changes), SPIKE_SHARE * float(np.diff(np.percentile(x, [1, 99]))[0])
+    )
     spikes = np.zeros(len(x), bool)
     for width in (1, 2):  # rows that stay together away from both neighbours, which agree with each other
         before, after = x[: -width - 1], x[width + 1 :]
@@ -143,7 +147,9 @@ def _cleaned(name: str, values: np.ndarray, notes: list[str]) -> np.ndarray:
     frozen = _frozen(x)
     for what, flags in (("outliers (a jump there and back)", spikes), ("frozen samples", frozen & ~spikes)):
         if flags.any():
-            notes.append(f"{name}: {flags.sum()} {what} count as missing ({100 * flags.mean():.2g} % of its values)")
+            notes.append(
+                f"{name}: {flags.sum()} {what} count as missing ({100 * flags.mean():.2g} % of its values)"
+            )
     values[known[spikes | frozen]] = np.nan
     return values
 
@@ -161,14 +167,20 @@ def _frozen(x: np.ndarray) -> np.ndarray:
 def _tell_of_intervals(stamps: np.ndarray, typical: float, dt: float, pieces: list, notes: list[str]) -> None:
     uneven = float((np.abs(np.diff(stamps) - typical) > 0.1 * typical).mean()) if len(stamps) > 1 else 0.0
     if uneven > 0.001:
-        notes.append(f"{100 * uneven:.2g} % of the intervals differ from the median of {typical:g} s by more than a tenth")
+        notes.append(
+            f"{100 * uneven:.2g} % of the intervals differ from the median of {typical:g} s by more than a tenth"
+        )
     if len(pieces) > 1:
         longest = max(stamps[b[0]] - stamps[a[-1]] for a, b in zip(pieces[:-1], pieces[1:], strict=True))
-        notes.append(f"{len(pieces) - 1} gaps (up to {longest:g} s) part the log into segments; none is bridged")
+        notes.append(
+            f"{len(pieces) - 1} gaps (up to {longest:g} s) part the log into segments; none is bridged"
+        )
     if dt > 1.5 * typical:
         notes.append(f"resampled from {typical:g} s to {dt:g} s: CVs by the mean, inputs by the last value")
     elif dt < typical / 1.5:
-        notes.append(f"sampled every {dt:g} s from rows {typical:g} s apart: inputs held, CVs missing between the rows")
+        notes.append(
+            f"sampled every {dt:g} s from rows {typical:g} s apart: inputs held, CVs missing between the rows"
+        )
 
 
 def _on_grid(
@@ -204,12 +216,16 @@ def _on_grid(
                     columns[name].append(made[name][part])
     for name, count in lost.items():
         if count:
-            notes.append(f"{name}: {count} samples without a value within {HOLD} samples are left out, which parts the log")
+            notes.append(
+                f"{name}: {count} samples without a value within {HOLD} samples are left out, which parts the log"
+            )
         if moved_within[name]:
             notes.append(f"{name} moves between two samples {moved_within[name]} times; seen at the next one")
     count = sum(map(len, times))
     if count < LEAST:
-        raise InputError("data", f"{count} samples of {dt:g} s", f"at least {LEAST} samples with values of all inputs")
+        raise InputError(
+            "data", f"{count} samples of {dt:g} s", f"at least {LEAST} samples with values of all inputs"
+        )
     values = {name: np.concatenate(parts) for name, parts in columns.items()}
     quality = {name: float(np.isfinite(entry).mean()) for name, entry in values.items()}
     for name, share in quality.items():

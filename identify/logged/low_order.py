@@ -50,7 +50,9 @@ def _searched(steps: np.ndarray, band: np.ndarray, integrating: bool) -> tuple[f
     lags, deads = (np.log(0.05), np.log(length)), (0.0, 0.6 * length)
     best = (np.inf, 0.0, 1.0, 0.0)
     for _ in range(ROUNDS):
-        lag, dead = np.meshgrid(np.exp(np.linspace(*lags, POINTS)), np.linspace(*deads, POINTS), indexing="ij")
+        lag, dead = np.meshgrid(
+            np.exp(np.linspace(*lags, POINTS)), np.linspace(*deads, POINTS), indexing="ij"
+        )
         shape = _shape(length, lag, dead, integrating) * weight
         gain = shape @ (steps * weight) / np.maximum((shape**2).sum(axis=-1), 1e-300)
         error = ((gain[..., None] * shape - steps * weight) ** 2).sum(axis=-1)

@@ -126,9 +126,7 @@ def likeliest(residuals: list[Float[np.ndarray, " sample"]]) -> Noise:
     return CANDIDATES[int(np.argmin(score))]
 
 
-def innovations(
-    noise: Noise, series: Float[np.ndarray, " sample"]
-) -> Float[np.ndarray, " sample"]:
+def innovations(noise: Noise, series: Float[np.ndarray, " sample"]) -> Float[np.ndarray, " sample"]:
     """What one segment of residuals has that could not be foreseen; NaN where there is no measurement."""
     known = np.isfinite(series)
     out = np.full(len(series), np.nan)

@@ -95,7 +95,11 @@ def sums(
         count += int(known.sum())
     shape = (inputs, length)
     return Sums(
-        total[:-1, :-1].reshape(*shape, *shape), total[:-1, -1].reshape(shape), float(total[-1, -1]), count, constant
+        total[:-1, :-1].reshape(*shape, *shape),
+        total[:-1, -1].reshape(shape),
+        float(total[-1, -1]),
+        count,
+        constant,
     )
 
 

@@ -9,7 +9,9 @@ from jaxtyping import Float
 from scipy.stats import chi2
 
 LAGS = 20  # of the test of whiteness
-SIGNIFICANT = 4.5  # standard deviations of a correlation, for some hundred of them together about one in a thousand
+SIGNIFICANT = (
+    4.5  # standard deviations of a correlation, for some hundred of them together about one in a thousand
+)
 LEAST = 0.05  # correlation below which feedback or a wrong model makes no difference
 EXACT = 1e-6  # share of the variance of a CV below which residuals are rounding
 

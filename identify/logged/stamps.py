@@ -69,7 +69,11 @@ def _dates(texts: list[str], field: Any) -> tuple[np.ndarray, tuple[str, ...]]:
         firsts, seconds_ = ([int(f[k]) for f in split if f] for k in (1, 3))
         if max(firsts) > 12 and max(seconds_) > 12:
             raise InputError(field(int(np.argmax(firsts))), texts[int(np.argmax(firsts))], EXPECTED)
-        if max(firsts) <= 12 and max(seconds_) <= 12 and any(a != b for a, b in zip(firsts, seconds_, strict=True)):
+        if (
+            max(firsts) <= 12
+            and max(seconds_) <= 12
+            and any(a != b for a, b in zip(firsts, seconds_, strict=True))
+        ):
             k = next(k for k, f in enumerate(split) if f and f[1] != f[3])
             expected = "a date that can be read in one way only, such as 2024-03-01"
             raise InputError(field(k), texts[k], expected, "Is the day or the month first?")
@@ -107,6 +111,8 @@ def _parted(found: re.Match[str], day_first: bool | None) -> datetime.datetime |
         hour = hour % 12 + (12 if found[9].lower() == "pm" else 0)
     try:
         year = year + 2000 if year < 100 else year
-        return datetime.datetime(year, month, day, hour, minute, second_, int((found[8] or "0")[:6].ljust(6, "0")))
+        return datetime.datetime(
+            year, month, day, hour, minute, second_, int((found[8] or "0")[:6].ljust(6, "0"))
+        )
     except ValueError:
         return None

@@ -20,8 +20,18 @@ from identify.logged.stamps import is_stamp, seconds
 from jaxmpc.errors import InputError, near
 
 MISSING = frozenset(
-    "nan na n/a null none bad - -- --- ? no_data nodata invalid questionable uncertain offline error shutdown comm_fail".split()
-) | {"", "no data", "bad input", "i/o timeout", "not connect", "scan off", "pt created", "out of serv", "#n/a"}
+    ["nan", "na", "n/a", "null", "none", "bad", "-", "--", "---", "?", "no_data", "nodata", "invalid", "questionable", "uncertain", "offline", "error", "shutdown", "comm_fail"]
+) | {
+    "",
+    "no data",
+    "bad input",
+    "i/o timeout",
+    "not connect",
+    "scan off",
+    "pt created",
+    "out of serv",
+    "#n/a",
+}
 UNIT = re.compile(r"^(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))$")  # NAME [UNIT] or NAME (UNIT)
 GROUPED = re.compile(r"^[+-]?\d{1,3}(\.\d{3})*(,\d+)?([eE][+-]?\d+)?$|^[+-]?\d*,?\d+([eE][+-]?\d+)?$")
 
@@ -165,7 +175,9 @@ def _is_unit_row(texts: Iterable[str], decimal: bool) -> bool:
     """Whether none of them is a number or a known word, and one has a letter, a percent sign or a degree."""
     texts = [str(text).strip() for text in texts]
     plain = [t for t in texts if t.lower() not in MISSING or t == "-"]
-    return bool(plain) and all(_number(t, decimal) is None and not is_stamp(t) for t in plain) and plain != ["-"]
+    return (
+        bool(plain) and all(_number(t, decimal) is None and not is_stamp(t) for t in plain) and plain != ["-"]
+    )
 
 
 def _number(text: str, decimal: bool) -> float | None:

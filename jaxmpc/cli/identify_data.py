@@ -27,6 +27,7 @@ def identify_data(options: Options) -> int:
     for target in (options.out, page):
         check_target("--out", target, [source])
     from figures.identification import write_page
+
     from identify.logged import identify_log
     from jaxmpc.programs.compilation import is_quiet
 

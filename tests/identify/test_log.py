@@ -21,7 +21,10 @@ def rows(times, u=None, y=None, separator=","):
     """Lines ``time, u, y``; u is 0, 1, 2, ... and y twice that where not given."""
     u = range(len(times)) if u is None else u
     y = [2 * k for k in range(len(times))] if y is None else y
-    return ["t,u,y".replace(",", separator), *(separator.join(map(str, row)) for row in zip(times, u, y, strict=True))]
+    return [
+        "t,u,y".replace(",", separator),
+        *(separator.join(map(str, row)) for row in zip(times, u, y, strict=True)),
+    ]
 
 
 def test_rows_at_equal_intervals_are_kept_as_they_are(tmp_path):
