@@ -1,4 +1,4 @@
-"""A co-simulation FMU of any process as a plant for closed loops (`jaxmpc.process.plant.StatefulPlant`).
+"""An FMU of any process, for co-simulation or model exchange, as a plant for loops (`jaxmpc.process.plant.StatefulPlant`).
 
 `FmuPlant` maps MVs, CVs and disturbances to variables of the FMU by name, moves the actuators, and steps the FMU in a
 process of its own (`identify.fmu_process`). FMPy's own simulation would interpolate continuous inputs between samples; the
@@ -26,9 +26,14 @@ MvActuator = Actuator | tuple[float, float] | None
 
 
 def validate_fmu(path: str | Path) -> list[str]:
-    """Problems that FMPy's validator finds in an FMU; empty if there are none."""
+    """Problems that FMPy's validator finds in an FMU; empty if there are none.
+
+    Raises:
+        InputError: for a file that is no FMU of FMI 2.0 or 3.0, with the reason.
+    """
     from fmpy.validation import validate_fmu as validate
 
+    FmuProcess(path).close()
     return list(validate(str(path)))
 
 

@@ -201,12 +201,14 @@ class FmuDescription:
     def step_of(self, dt: float, substep: float | None) -> tuple[float, int]:
         """The communication step [s] and how many of them make a sampling interval `dt` [s].
 
-        It is `substep`; without, that of the default experiment or the FMU's own, or the next smaller one if it may vary.
+        It is `substep`; without, that of the default experiment or the FMU's own, or the next smaller one if it may vary. An
+        FMU for model exchange has none: it is integrated from sample to sample.
 
         Raises:
             InputError: where that is no whole number.
         """
-        own = [step for step in (self.experiment["step"], self.fixed_step) if step] or [dt]
+        stepped = "CoSimulation" in self.kinds
+        own = [step for step in (self.experiment["step"], self.fixed_step) if step and stepped] or [dt]
         steps = own if substep is None else [substep]
         for step in steps:
             count = max(round(dt / step), 1)

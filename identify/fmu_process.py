@@ -31,7 +31,7 @@ WORKER = Path(__file__).with_name("fmu_worker.py")
 
 
 class FmuProcess:
-    """An FMU of FMI 2.0 or 3.0 in its own process, which has read its description; `load` it to use it for co-simulation.
+    """An FMU of FMI 2.0 or 3.0 in its own process, which has read its description; `load` it to run it.
 
     Use it as a context manager, or `close` it; that frees the FMU, ends its process and removes the unpacked files.
     The process also ends when this one ends, however that happens.
@@ -88,7 +88,7 @@ class FmuProcess:
         """Load the library of the FMU and instantiate it; twice is once.
 
         Raises:
-            InputError: for an FMU that is not for co-simulation, not for this machine or not what it says it is.
+            InputError: for an FMU of neither kind that can be run, not for this machine or not what it says it is.
             PlantError: if the FMU fails; so do all methods.
         """
         if not self._loaded:

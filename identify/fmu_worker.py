@@ -166,7 +166,7 @@ def library_of(folder: Path, description: Any) -> Path:
     """The library for this machine; refuses an FMU without."""
     from fmpy import platform, platform_tuple, sharedLibraryExtension
 
-    name = description.coSimulation.modelIdentifier
+    name = (description.coSimulation or description.modelExchange).modelIdentifier
     here = platform_tuple if description.fmiVersion.startswith("3") else platform
     library = folder / "binaries" / here / f"{name}{sharedLibraryExtension}"
     if library.is_file():
@@ -188,6 +188,8 @@ class Runner:
         self._time, self._used = 0.0, False
         self._stop: float | None = None
         self._fmu: Any = None
+        self._exchange: Any = None  # the run of an FMU for model exchange
+        self._held: dict[str, Any] = {}
 
     def _begin(self, call: str) -> None:
         text = f"{time.monotonic():.3f} {call}".encode()[:NOTE_BYTES]
@@ -208,21 +210,29 @@ class Runner:
     def load(self) -> None:
         """Unpack the FMU, load its library and instantiate it."""
         described = self._described
-        if described.coSimulation is None:
-            expected = f"a co-simulation FMU (it has only: {', '.join(kinds_of(described)) or 'nothing'})"
+        if described.coSimulation is None and described.modelExchange is None:
+            has = ", ".join(kinds_of(described)) or "nothing"
+            expected = f"an FMU for co-simulation or model exchange (it has only: {has})"
             raise RefusedError(expected, "Export it once more for co-simulation")
         self._begin("the unpacking")
         unpack(self.path, self.folder)
-        from fmpy.fmi2 import FMU2Slave
-        from fmpy.fmi3 import FMU3Slave
+        self._instantiate()
 
+    def _instantiate(self) -> None:
+        """Load the library and make an instance."""
+        described = self._described
+        kind = described.coSimulation or described.modelExchange
+        from fmpy.fmi2 import FMU2Model, FMU2Slave
+        from fmpy.fmi3 import FMU3Model, FMU3Slave
+
+        made = (FMU2Slave, FMU3Slave) if described.coSimulation else (FMU2Model, FMU3Model)
         library = library_of(self.folder, described)
         self._begin("the loading of its library")
         try:
-            self._fmu = (FMU3Slave if self.fmi == 3 else FMU2Slave)(
+            self._fmu = made[self.fmi - 2](
                 guid=described.guid,
                 unzipDirectory=str(self.folder),
-                modelIdentifier=described.coSimulation.modelIdentifier,
+                modelIdentifier=kind.modelIdentifier,
                 instanceName="fmu",
             )
         except AttributeError as error:  # how ctypes says that a library has no such function
@@ -250,8 +260,13 @@ class Runner:
         """Begin a new run at time zero with start values, and inputs that hold from then on."""
         if self._used:
             self._begin("reset")
-            self._fmu.reset()
+            try:
+                self._fmu.reset()
+            except Exception:  # many FMUs cannot: another instance begins anew, too
+                self._fmu.freeInstance()
+                self._instantiate()
         self._time, self._used, self._stop = 0.0, True, stop
+        self._exchange = None
         if self.fmi == 2:
             self._begin("setupExperiment")
             self._fmu.setupExperiment(startTime=0.0, stopTime=stop)
@@ -261,6 +276,21 @@ class Runner:
         self.set(inputs)
         self._begin("its initialisation")
         self._fmu.exitInitializationMode()
+        if self._described.coSimulation is None:
+            from identify.fmu_exchange import Exchange
+
+            self._exchange, self._held = Exchange(self._fmu, self._described), dict(inputs)
+
+    def change(self, values: dict[str, Any]) -> None:
+        """Set variables while it runs; for model exchange in an event, and only those that change."""
+        if self._exchange is None:
+            self.set(values)
+            return
+        new = {name: value for name, value in values.items() if self._held.get(name) != value}
+        if new:
+            self._begin(f"an event at t = {self._time:.10g} s")
+            self._exchange.change(lambda: self.set(new))
+            self._held |= new
 
     def set(self, values: dict[str, Any]) -> None:
         """Set variables and elements of arrays."""
@@ -312,15 +342,20 @@ class Runner:
     def step(self, dt: float, count: int) -> None:
         """Step `count` times by `dt` [s]."""
         begin = self._time
+        call = "doStep" if self._exchange is None else "the integration"
         for k in range(count):
-            self._begin(f"doStep at t = {self._time:.10g} s")
+            self._begin(f"{call} at t = {self._time:.10g} s")
+            end = begin + (k + 1) * dt
             try:
-                said = self._fmu.doStep(self._time, dt)
+                if self._exchange is not None:
+                    self._exchange.step(end, dt)
+                else:
+                    said = self._fmu.doStep(self._time, dt)
+                    if self.fmi == 3 and said[1]:
+                        raise RuntimeError("it asks for the end of the simulation")
             except Exception as error:
                 raise RuntimeError(f"{error}{self._beyond()}") from None
-            if self.fmi == 3 and said[1]:
-                raise RuntimeError(f"it asks for the end of the simulation{self._beyond()}")
-            self._time = begin + (k + 1) * dt
+            self._time = end
 
     def _beyond(self) -> str:
         """What may be the reason for a failed step: some FMUs end where their default experiment does, if not told when."""
@@ -359,7 +394,7 @@ class Runner:
             if "start" in request:
                 self.start(*request["start"])
             if "set" in request:
-                self.set(request["set"])
+                self.change(request["set"])
             if "step" in request:
                 self.step(*request["step"])
             return {"values": self.get(request["get"])} if "get" in request else {}

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from identify.step_test import settling
+from identify.step_test import response_words, settling
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.process import Process, amount
 
@@ -61,7 +61,7 @@ def _pairs(process: Process, model: StepResponseModel) -> list[Finding]:
             continue
         begin = int(np.argmax(np.abs(s[i, j]) > 0.02 * peak))
         rise = (int(np.argmax(np.abs(s[i, j]) >= 0.63 * abs(row.gain))) + 1 - begin) if row.gain else 0
-        words = f"gain {row.gain:.4g}{unit}, dead time {begin * model.dt:g} s, settled after {row.settling_time:g} s"
+        words = response_words(row, s[i, j], unit, model.dt)
         if not row.settled:
             slope = (s[i, j, -1] - s[i, j, -2]) / model.dt if model.samples > 1 else np.inf
             words = (
@@ -74,9 +74,7 @@ def _pairs(process: Process, model: StepResponseModel) -> list[Finding]:
             advice = f"reaches 63 % within {count}: what it does in between is not seen; sample faster"
             out.append(Finding("look", subject, f"{words}; {advice}"))
         elif row.gain * s[i, j, begin] < 0:
-            out.append(
-                Finding("look", subject, f"{words}; it starts in the other direction (inverse response)")
-            )
+            out.append(Finding("look", subject, words))
         else:
             out.append(Finding("fine", subject, words))
     return out

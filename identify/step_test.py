@@ -75,6 +75,22 @@ def settling_notes(model: StepResponseModel) -> list[str]:
     ]
 
 
+def response_words(row: Settling, s: Float[np.ndarray, " n"], per: str, dt: float) -> str:
+    """Gain, dead time and settling time of a response in words, and whether it starts in the other direction.
+
+    Args:
+        row: how far it has come.
+        s: S(1)..S(N) [CV unit per input unit].
+        per: that unit, with a space before it.
+        dt: sampling interval [s].
+    """
+    begin = int(np.argmax(np.abs(s) > 0.02 * np.abs(s).max()))
+    ends = f"settled after {row.settling_time:g} s" if row.settled else f"at {row.gain:.4g}{per} in the end"
+    gain = f"gain {row.gain:.4g}{per}, " if row.settled else ""
+    inverse = "; it starts in the other direction (inverse response)" if row.gain * s[begin] < 0 else ""
+    return f"{gain}dead time {begin * dt:g} s, {ends}{inverse}"
+
+
 def apply_sequence(
     plant: Any,
     state: Any,

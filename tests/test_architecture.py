@@ -22,7 +22,7 @@ COMPOSITION_ROOT = "jaxmpc/cli/"
 APPS = "studies/notebooks/"  # what a user opens and edits: puts studies and figures together
 DOORS = {
     "highspy": ("jaxmpc/integer/highs.py",),
-    "fmpy": ("identify/fmu.py", "identify/fmu_worker.py"),
+    "fmpy": ("identify/fmu.py", "identify/fmu_worker.py", "identify/fmu_exchange.py"),
     "matplotlib": ("figures/",),
     "dask": ("studies/",),
     "distributed": ("studies/",),
@@ -75,7 +75,8 @@ TEST_ONLY = {
     "tests",
 }
 SOLVES = {  # figures read results: nothing that predicts, solves or simulates
-    "jaxmpc.model",
+    "jaxmpc.model.step_response",
+    "jaxmpc.model.transfer_function",
     "jaxmpc.problem.condense",
     "jaxmpc.relaxed",
     "jaxmpc.integer",

@@ -1,10 +1,12 @@
-"""``jaxmpc fmu build``, ``fmu info`` and ``identify``: the well as an FMU, what FMUs are, and a model from step tests."""
+"""``jaxmpc fmu build``, ``fmu info`` and ``identify``: the well as an FMU, what FMUs are, and a model of anything."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
 
+from jaxmpc.cli.identify_data import DATA_OPTIONS, identify_data
+from jaxmpc.cli.identify_fmu import FMU_OPTIONS, identify_fmu
 from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, choice, command, named_number, option
 from jaxmpc.errors import InputError, near
 from jaxmpc.files import check_target
@@ -38,35 +40,82 @@ def info(options: Options) -> int:
     return EXIT_OPTIMAL
 
 
-@command(
-    "identify",
-    option(
-        "process",
-        "PROCESS",
-        "process file or shipped process (default: the well of the thesis)",
-        str,
-        nargs="?",
-    ),
-    option("--plant", "NAME", "which plant of the process (default: the first)", ""),
+PROCESS_OPTIONS = (
+    option("--plant", "NAME", "process: which of its plants (default: the first)", str),
+    option("--step", "MV=SIZE", "process: step of an MV, if not as it says", str, action="append"),
+)
+STEPPED_OPTIONS = (
     option(
         "--at",
         "MV=VALUE",
-        "where an MV stands before the steps, if not as the process says",
+        "process: where an MV stands before the steps, if not as it says; "
+        "FMU: MV=V1,V2,..., a gain schedule over one or two MVs",
         str,
         action="append",
     ),
-    option("--step", "MV=SIZE", "step of an MV, if not as the process says", str, action="append"),
-    option("--samples", "N", "coefficients [samples] (default: as the process says)", int),
-    option("--out", "MODEL.json", "where to write", Path("model.json")),
+)
+FOREIGN_OPTIONS = (
+    option(
+        "--mv",
+        "NAME",
+        "FMU: NAME[=VALUE[:STEP]], where it stands and its step; data: a column",
+        str,
+        action="append",
+    ),
+    option("--cv", "NAME", "FMU: a variable; data: a column", str, action="append"),
+    option("--dv", "NAME", "measured disturbance, as --mv", str, action="append"),
+    option("--dt", "S", "FMU, data: sampling interval [s]", float),
+)
+KINDS = {  # of sources: what they are called, and their own options
+    "process": ("a process", (*PROCESS_OPTIONS, *STEPPED_OPTIONS)),
+    "fmu": ("an FMU", (*FOREIGN_OPTIONS, *STEPPED_OPTIONS, *FMU_OPTIONS)),
+    "data": ("logged data", (*FOREIGN_OPTIONS, *DATA_OPTIONS)),
+}
+
+
+@command(
+    "identify",
+    option(
+        "source",
+        "SOURCE",
+        "process file or shipped process (default: the well of the thesis), FILE.fmu, or logged data (.csv, .parquet)",
+        str,
+        nargs="?",
+    ),
+    *FOREIGN_OPTIONS,
+    *STEPPED_OPTIONS,
+    *PROCESS_OPTIONS,
+    *FMU_OPTIONS,
+    *DATA_OPTIONS,
+    option("--samples", "N", "coefficients [samples] (default: as the process says; 250)", int),
+    option(
+        "--out",
+        "MODEL.json",
+        "where to write; the page of an FMU or of data goes beside it",
+        Path("model.json"),
+    ),
+    epilog="Exit status: 0 model written, 2 bad input, 1 the plant failed or anything else, 130 stopped by Ctrl-C.",
 )
 def identify(options: Options) -> int:
-    """Identify a step-response model: settle a plant and step each MV, and each measured disturbance, alone."""
+    """Identify a step-response model: step a plant or an FMU, each input alone, or fit logged data."""
+    suffix = Path(options.source or "").suffix.lower()
+    kind = {".fmu": "fmu", ".csv": "data", ".parquet": "data"}.get(suffix, "process")
+    called, own = KINDS[kind]
+    for name in dict.fromkeys(name for _, listed in KINDS.values() for name, _ in listed):
+        given = getattr(options, name.removeprefix("--").replace("-", "_"))
+        if name not in dict(own) and given not in (None, False):
+            raise InputError(name, given, f"none: it is not for {called}")
+    return {"fmu": identify_fmu, "data": identify_data, "process": _identify_process}[kind](options)
+
+
+def _identify_process(options: Options) -> int:
+    """Settle a plant of a process and step each MV, and each measured disturbance, alone."""
     check_target("--out", options.out)
     from identify.plants import closing, identified, open_plant
     from identify.step_test import settling_notes
     from jaxmpc.process.file import DEFAULT_PROCESS, load_process
 
-    process = load_process(options.process or DEFAULT_PROCESS)
+    process = load_process(options.source or DEFAULT_PROCESS)
     point, steps = (
         dict(named_number(name, text) for text in given or ())
         for name, given in (("--at", options.at), ("--step", options.step))
@@ -77,7 +126,7 @@ def identify(options: Options) -> int:
                 raise InputError(
                     name, mv, f"an MV: {', '.join(process.mv_names)}", near(mv, process.mv_names)
                 )
-    with closing(open_plant(process, options.plant, actual=False)) as plant:
+    with closing(open_plant(process, options.plant or "", actual=False)) as plant:
         model = identified(process, plant, point, steps, options.samples)
     for note in settling_notes(model):
         print(f"jaxmpc: {note}", file=sys.stderr)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, command, named_number, option
 from jaxmpc.errors import InputError
@@ -31,10 +32,12 @@ def new(options: Options) -> int:
     model = StepResponseModel.load(options.model)
     name = _named(out.stem)
     file = _relative(options.model, out.parent)
+    fmu, lost = _fmu_of(model, out.parent)
     text, guesses = new_process(
         model,
         file,
         name,
+        fmu=fmu,
         steps=dict(named_number("--step", text) for text in options.step or ()),
         switches=options.on_off or (),
     )
@@ -42,6 +45,8 @@ def new(options: Options) -> int:
     load_process(out)
     print(out)
     print("Guessed, so look at it first:", *guesses, sep="\n  ")
+    if lost:
+        print(lost)
     print(f"Next: jaxmpc process check {out}, then jaxmpc study run comparison --process {out}")
     return EXIT_OPTIMAL
 
@@ -50,6 +55,21 @@ def _named(stem: str) -> str:
     """A name for a process from that of its file."""
     text = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in stem).strip("-")
     return text[:64] if text and text[0].isalpha() else f"process-{text}"[:64]
+
+
+def _fmu_of(model: Any, folder: Path) -> tuple[str, str]:
+    """The FMU of a model as the process file names it, or why it is not among the plants."""
+    import hashlib
+
+    found = dict(model.provenance)
+    if not found.get("fmu"):
+        return "", ""
+    path = Path(found["fmu"])
+    if not path.is_file():
+        return "", f"Without the FMU as a plant: {path} is not there any more."
+    if hashlib.sha256(path.read_bytes()).hexdigest() != found.get("fmu_hash"):
+        return "", f"Without the FMU as a plant: {path} is another one now; identify it again."
+    return _relative(path, folder), ""
 
 
 def _relative(file: Path, folder: Path) -> str:

@@ -37,7 +37,7 @@ class Record:
     """A test or a piece of logged data, and what the model makes of it.
 
     Attributes:
-        title: for example ``choke +2 %``.
+        title: for example ``valve +2 %``.
         times: [s].
         inputs: MVs, then DVs [their units].
         measured: CVs [CV unit]; NaN where there is no measurement.

@@ -205,11 +205,18 @@ def make_model(
         cv_units=tuple(cv_units),
         mv_units=tuple(mv_units),
         working_point=tuple((str(k), float(v)) for k, v in pairs(working_point)),
-        provenance=tuple((str(k), v if not isinstance(v, list) else tuple(v)) for k, v in pairs(provenance)),
+        provenance=tuple((str(k), _frozen(v)) for k, v in pairs(provenance)),
         dv_coefficients=jnp.asarray(of_dvs) if dv_names else None,  # pyright: ignore[reportArgumentType]
         dv_names=dv_names,
         dv_units=tuple(dv_units),
     )
+
+
+def _frozen(value: Any) -> Any:
+    """A JSON value that can be hashed, as the facts of a compiled program are: lists as tuples, objects as pairs."""
+    if isinstance(value, dict):
+        return tuple((key, _frozen(one)) for key, one in value.items())
+    return tuple(map(_frozen, value)) if isinstance(value, list | tuple) else value
 
 
 def _checked_responses(path: str, given: Any, cvs: int, inputs: int, kind: str, samples: int | None = None):

@@ -19,6 +19,7 @@ from jaxmpc.process.process import amount
 SETTLED = 0.02  # of the largest value of a response: within it, it has settled
 LEAST_HORIZON = 20  # samples
 LONGEST_BLOCK = 64  # samples
+STOP = 1e7  # s
 
 
 def new_process(
@@ -26,6 +27,7 @@ def new_process(
     file: str,
     name: str,
     *,
+    fmu: str = "",
     steps: Mapping[str, float] | None = None,
     switches: Sequence[str] = (),
 ) -> tuple[str, list[str]]:
@@ -35,6 +37,7 @@ def new_process(
         model: of the process, which is its own plant until there is a better one.
         file: of the model, as the process file names it.
         name: of the process.
+        fmu: from which the model was identified, as the process file names it; the first plant.
         steps: sizes of the steps of MVs that do not take every value [MV unit].
         switches: MVs that are on or off.
 
@@ -44,17 +47,25 @@ def new_process(
     Raises:
         InputError: for names that no process may have, MVs that the model has not, or steps that are not positive.
     """
-    steps = dict(steps or {})
+    found = dict(model.provenance)
+    moved = {mv: dict(how) for mv, how in dict(found.get("actuators", ())).items()}
+    listed = {mv: how["values"] for mv, how in moved.items() if how["kind"] == "values"}
+    switches = (
+        *switches,
+        *(mv for mv, how in moved.items() if how["kind"] == "on-off" and mv not in switches),
+    )
+    steps = {mv: how["step"] for mv, how in moved.items() if how["kind"] == "stepped"} | dict(steps or {})
     _check(model, steps, switches)
     point = dict(model.working_point)
     cv_units, mv_units = (units or ("1",) * len(names) for units, names in _names(model))
+    known = {mv: (float(low), float(high)) for mv, (low, high) in dict(found.get("ranges", ())).items()}
     ranges = {
-        mv: _range(unit, point.get(mv), mv in switches)
+        mv: known.get(mv) or _range(unit, point.get(mv), mv in switches)
         for mv, unit in zip(model.mv_names, mv_units, strict=True)
     }
     spans = np.array([(high - low) / (1 if mv in switches else 4) for mv, (low, high) in ranges.items()])
     moves = {
-        mv: high - low if mv in switches else steps.get(mv) or _round((high - low) / 50)
+        mv: high - low if mv in {*switches, *listed} else steps.get(mv) or _round((high - low) / 50)
         for mv, (low, high) in ranges.items()
     }
     gains = np.asarray(model.coefficients)[:, :, -1]
@@ -67,7 +78,8 @@ def new_process(
             "the working point: the model has none, so that all CVs and MVs are deviations from it"
         )
     guesses += [
-        f"the range of {mv}: {low:g} to {amount(high, unit)}"
+        (f"of {mv}, with a range from" if mv in known else f"the range of {mv}:")
+        + f" {low:g} to {amount(high, unit)}"
         + (", one or the other" if mv in switches else f", and at most {moves[mv]:g} per sample")
         for (mv, (low, high)), unit in zip(ranges.items(), mv_units, strict=True)
     ]
@@ -77,7 +89,7 @@ def new_process(
     ]
     guesses.append(f"horizons of {horizon} and {control} samples, by how long the responses take")
     guesses.append("all weights, deadzones and setpoints")
-    lines = _head(model, file, name)
+    lines = _head(model, file, name, fmu)
     for cv, unit, span in zip(model.cv_names, cv_units, cv_spans, strict=True):
         lines += [
             "[[cv]]",
@@ -90,9 +102,15 @@ def new_process(
             "[[mv]]",
             *_variable(mv, unit, span, f"guessed: {'all' if mv in switches else 'a quarter'} of its range"),
         ]
-        lines += [f"low = {low:g} # guessed", f"high = {high:g} # guessed"]
+        guessed = " # as the FMU declares it" if mv in known else " # guessed"
+        lines += [f"low = {low:g}{guessed}", f"high = {high:g}{guessed}"]
         if mv in switches:
             lines += ['actuator = { kind = "on-off" } # stands at low or at high']
+        elif mv in listed:
+            lines += [
+                f"move = {moves[mv]:g}",
+                f'actuator = {{ kind = "values", values = {list(listed[mv])} }}',
+            ]
         elif mv in steps:
             lines += [f"move = {moves[mv]:g} # guessed: largest move per sample"]
             lines += [f'actuator = {{ kind = "stepped", step = {steps[mv]:g} }}']
@@ -106,6 +124,8 @@ def new_process(
             "",
         ]
     for cv, unit, span in zip(model.cv_names, cv_units, cv_spans, strict=True):
+        if fmu:
+            break  # an FMU has no loads on its CVs
         lines += ["[[disturbance]] # not measured: added to the CV"]
         lines += [
             f'name = "output.{cv}"',
@@ -208,7 +228,7 @@ def blocks_of(horizon: int) -> list[int]:
     return out
 
 
-def _head(model: StepResponseModel, file: str, name: str) -> list[str]:
+def _head(model: StepResponseModel, file: str, name: str, fmu: str) -> list[str]:
     return [
         "# A process for studies of MPC with discrete actuators. What is guessed says so: look at it first.",
         "# `jaxmpc process check` judges this file and draws the responses.",
@@ -219,10 +239,39 @@ def _head(model: StepResponseModel, file: str, name: str) -> list[str]:
         "[model]",
         f"file = {_text(file)}",
         "",
+        *(_fmu_plant(model, fmu) if fmu else []),
         "[plants.model] # the model is its own plant; studies may vary gains, dead times and time scales of it",
         'kind = "model"',
         "",
     ]
+
+
+def _fmu_plant(model: StepResponseModel, fmu: str) -> list[str]:
+    """The FMU with the start values, names and working point of the identification."""
+    found, point = dict(model.provenance), dict(model.working_point)
+    options = {
+        "start": dict(found.get("start", ())),
+        "variables": dict(found.get("variables", ())),
+        "working_point": {mv: point[mv] for mv in model.mv_names if mv in point},
+    }
+    lines = [f"{key} = {_inline(values)}" for key, values in options.items() if values]
+    lines += [f"settle = {found['settle']:g} # s, before a loop begins"] if found.get("settle") else []
+    lines += [f"stop_time = {STOP:g} # s; the FMU is told that runs end later than its experiment"] * bool(
+        found.get("stops")
+    )
+    head = ["[plants.fmu] # the first plant: what the model was identified from", 'kind = "fmu"']
+    return [*head, f"source = {_text(fmu)}", "", "[plants.fmu.options]", *lines, ""]
+
+
+def _inline(values: Mapping[str, object]) -> str:
+    """An inline table of numbers, flags and texts."""
+
+    def shown(value: object) -> str:
+        if isinstance(value, bool):
+            return str(value).lower()
+        return _text(value) if isinstance(value, str) else f"{value:.15g}"
+
+    return "{ " + ", ".join(f"{_text(name)} = {shown(value)}" for name, value in values.items()) + " }"
 
 
 def _variable(name: str, unit: str, span: float, why: str) -> list[str]:

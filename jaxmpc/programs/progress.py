@@ -57,11 +57,11 @@ def shown() -> contextlib.AbstractContextManager[None]:
 
 
 @contextlib.contextmanager
-def watched(seen: Callable[[float], Seen]) -> Iterator[None]:
-    """Show a search as long as this is entered.
+def watched(seen: Callable[[float], object]) -> Iterator[None]:
+    """Show a search, or other long work, as long as this is entered.
 
     Args:
-        seen: what is known of it, so many seconds after this was entered; called in a thread of its own.
+        seen: what is known of it as text or `Seen`, so many seconds after this was entered; called in a thread of its own.
     """
     if not _shown.commands or is_quiet():
         yield

@@ -311,7 +311,7 @@ LIBRARY = f"binaries/{fmpy.platform}/sum{fmpy.sharedLibraryExtension}"
         ({"modelDescription.xml": "text"}, "that is XML"),
         (description("<Real/>", "<Rel/>"), "that follows the standard .*line 13.*'Rel'"),
         (description('fmiVersion="2.0"', 'fmiVersion="1.0"'), r"FMI 2.0 or 3.0 \(its version is 1.0\)"),
-        (description("CoSimulation", "ModelExchange"), r"a co-simulation FMU \(it has only: ModelExchange\)"),
+        (description("CoSimulation", "ModelExchange"), r"whose library can be loaded \(.*\)$"),
         ({LIBRARY: None, "binaries/win32/sum.dll": "x"}, r"a library for \w+ \(it has one for win32\)"),
         (
             {LIBRARY: None, "sources/sum.c": "int x;"},

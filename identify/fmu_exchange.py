@@ -1,0 +1,160 @@
+"""A model-exchange FMU in time: CVode integrates its states, and its time, state and step events are handled.
+
+`identify.fmu_worker` steps it with this as it steps one for co-simulation: inputs hold from one communication point to the
+next. A change of inputs is an event, as the standard wants it for discrete ones and parameters.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from fmpy.sundials import NV_DATA_S, CVodeSolver, SUNContext_PushErrHandler
+from fmpy.sundials.libraries import sundials_core
+
+TOLERANCE = 1e-8  # relative; small steps of an input change large states by little
+MAX_STEPS = 1_000_000  # of the solver between two points; the time limit of a call ends it before
+CLOSE = 1e-10  # of a time: two times that are one
+
+
+class _Solver(CVodeSolver):
+    """CVode that tells a failure of the FMU inside its callbacks, which ctypes would only print."""
+
+    failure: Exception | None = None
+
+    def __init__(self, **options: Any):
+        super().__init__(**options)
+        sundials_core.SUNContext_ClearErrHandlers(self.sunctx)  # what it prints is in the error, too
+        SUNContext_PushErrHandler(self.sunctx, self.ehfun_, None)
+
+    def f(self, t: float, y: Any, ydot: Any, user_data: Any) -> int:
+        """Derivatives; asks for a smaller step where they are no numbers."""
+        try:
+            super().f(t, y, ydot, user_data)
+        except Exception as error:
+            self.failure = error
+            return -1
+        rates = np.ctypeslib.as_array(NV_DATA_S(ydot), (self.nx,))
+        if np.isfinite(rates).all():
+            self.failure = None
+            return 0
+        k = int(np.flatnonzero(~np.isfinite(rates))[0])
+        self.failure = ArithmeticError(f"the derivative of state {k + 1} is {rates[k]:g} at t = {t:.10g} s")
+        return 1
+
+    def g(self, t: float, y: Any, gout: Any, user_data: Any) -> int:
+        """Event indicators."""
+        try:
+            return super().g(t, y, gout, user_data)
+        except Exception as error:
+            self.failure = error
+            return -1
+
+
+class _Held:
+    """Inputs that hold while CVode steps."""
+
+    def apply(self, time: float) -> None:
+        """Nothing to do."""
+
+
+class Exchange:
+    """The run of a model-exchange FMU from the end of its initialisation on.
+
+    Args:
+        fmu: of FMPy, which has left its initialisation mode.
+        described: FMPy's reading of its description.
+    """
+
+    def __init__(self, fmu: Any, described: Any):
+        self._fmu, self._described = fmu, described
+        self._fmi3 = described.fmiVersion.startswith("3")
+        self._time, self._next_event = 0.0, math.inf
+        self._solver: _Solver | None = None
+        self._update()
+
+    def change(self, setting: Callable[[], None]) -> None:
+        """Set variables in an event."""
+        self._fmu.enterEventMode()
+        setting()
+        self._update()
+
+    def step(self, end: float, largest: float) -> None:
+        """Go to a time [s] in solver steps of at most `largest` [s]."""
+        if self._solver is None:
+            self._solver = self._new_solver(largest)
+        close = CLOSE * max(1.0, end)
+        while True:
+            if self._next_event <= self._time + close:
+                self._event(max(self._next_event, self._time))
+                continue
+            if self._time >= end - close:
+                self._time = max(self._time, end)  # what is left is rounding
+                return
+            aim = min(end, self._next_event)
+            crossed = self._integrate(self._solver, aim)
+            stepped, ends = False, False
+            if self._described.modelExchange.needsCompletedIntegratorStep:
+                stepped, ends = self._fmu.completedIntegratorStep()
+            _check(ends)
+            if crossed or stepped or self._time >= self._next_event:
+                self._event(self._time)
+
+    def _integrate(self, solver: _Solver, aim: float) -> bool:
+        """Up to a time or the next state event; returns whether it is one."""
+        try:
+            crossed, _, reached = solver.step(self._time, aim)
+        except Exception as error:
+            if solver.failure is not None:
+                raise solver.failure from None
+            raise RuntimeError(f"CVode cannot integrate it after t = {self._time:.10g} s ({error})") from None
+        self._time = aim if abs(reached - aim) <= CLOSE * max(1.0, aim) else reached
+        self._fmu.setTime(self._time)
+        return crossed
+
+    def _event(self, time: float) -> None:
+        self._time = time
+        self._fmu.setTime(time)
+        self._fmu.enterEventMode()
+        self._update()
+
+    def _update(self) -> None:
+        """Iterate the discrete states, go on in continuous time, and let the solver begin there."""
+        update = self._fmu.updateDiscreteStates if self._fmi3 else self._fmu.newDiscreteStates
+        again = True
+        while again:
+            again, ends, _, _, planned, when = update()
+            _check(ends)
+            self._next_event = when if planned else math.inf
+        if self._next_event <= self._time:
+            self._next_event = math.inf  # of an event that has just been handled
+        self._fmu.enterContinuousTimeMode()
+        if self._solver is not None:
+            self._solver.reset(self._time)
+
+    def _new_solver(self, largest: float) -> _Solver:
+        fmu, described = self._fmu, self._described
+        states = fmu.getNumberOfContinuousStates() if self._fmi3 else described.numberOfContinuousStates
+        indicators = fmu.getNumberOfEventIndicators() if self._fmi3 else described.numberOfEventIndicators
+        return _Solver(
+            nx=states or 0,
+            nz=indicators or 0,
+            get_x=fmu.getContinuousStates,
+            set_x=fmu.setContinuousStates,
+            get_dx=fmu.getContinuousStateDerivatives if self._fmi3 else fmu.getDerivatives,
+            get_z=fmu.getEventIndicators,
+            get_nominals=fmu.getNominalsOfContinuousStates,
+            set_time=fmu.setTime,
+            input=_Held(),
+            startTime=self._time,
+            maxStep=largest,
+            relativeTolerance=TOLERANCE,
+            maxNumSteps=MAX_STEPS,
+        )
+
+
+def _check(ends: Any) -> None:
+    if ends:
+        raise RuntimeError("it asks for the end of the simulation")

@@ -1,0 +1,392 @@
+"""Identification of any FMU by step tests: every input alone, up and down, in full and half size, from a settled point.
+
+A response is the difference of a stepped run and one without the step, at the same times: what the FMU does by itself, a
+rest of settling or noise that repeats after a reset, is in both. The model is the mean of up and down; the other tests judge
+it (`identify.fmu_verdicts`). Noise that does not repeat is averaged over runs. ``jaxmpc identify FILE.fmu`` calls it.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from identify.fmu import FmuPlant
+from identify.fmu_description import BITS, REALS, FmuDescription, Value
+from identify.fmu_inputs import WAYS, Moved, actuator_of, error_of, legal_names, moved
+from identify.fmu_process import TIME_LIMIT, FmuProcess
+from identify.fmu_verdicts import Tests, advice_of, judged
+from identify.step_test import SETTLE_SAMPLES, apply_sequence
+from jaxmpc.check import is_count, is_number
+from jaxmpc.controller.schedule import ModelSchedule, make_schedule
+from jaxmpc.errors import InputError, near
+from jaxmpc.model.identification import Identification, Record
+from jaxmpc.model.step_response import StepResponseModel, make_model
+
+LONGEST = 64  # times as long as a response an FMU may take to settle
+STILL = 1e-6  # of all that it has moved: it has settled
+GROWING = 1.5  # of a slope from one stretch to the next: an FMU that runs away
+PRECISE = 0.001  # of the largest coefficient: standard error that repetitions are to reach
+MOST_REPEATS = 400
+MOST_SAMPLES = 400_000  # simulated for the tests of one input
+REPEATED = 1e-9  # of the largest value: two runs are the same
+
+Told = Callable[[str], None]
+
+
+def identify_fmu(
+    path: str | Path,
+    mvs: Mapping[str, tuple[Value | None, float | None]],
+    cvs: Sequence[str],
+    dt: float,
+    samples: int = 250,
+    *,
+    dvs: Mapping[str, tuple[Value | None, float | None]] | None = None,
+    start: Mapping[str, Value] | None = None,
+    settle: float | None = None,
+    time_limit: float = TIME_LIMIT,
+    told: Told | None = None,
+) -> Identification:
+    """Identify a step-response model of an FMU, and judge it.
+
+    Args:
+        path: of the FMU, of FMI 2.0 or 3.0, for co-simulation or model exchange.
+        mvs: by the names of its variables, where they stand (their start values if None) and the size of their steps (the
+            least that makes sense if None) [their unit].
+        cvs: names of its variables.
+        dt: sampling interval [s].
+        samples: N, the number of coefficients.
+        dvs: as `mvs`, of measured disturbances.
+        start: start values and parameters by name.
+        settle: simulated at the working point before the steps [s]; by default until it stands still.
+        time_limit: for one call of the FMU [s].
+        told: called with a sentence on what is being done.
+
+    Returns:
+        Model, verdicts, and the tests as records; those of half size, which the model has not seen, as left out.
+
+    Raises:
+        InputError: for a file, variable, value or step that cannot be, before anything is simulated.
+        PlantError: if the FMU fails.
+    """
+    tests = _Tests(path, mvs, cvs, dt, samples, dvs or {}, start or {}, settle, time_limit, told)
+    return tests.identification()
+
+
+def identify_fmu_schedule(
+    path: str | Path,
+    mvs: Mapping[str, tuple[Value | None, float | None]],
+    cvs: Sequence[str],
+    dt: float,
+    samples: int,
+    at: Mapping[str, Sequence[Value]],
+    *,
+    told: Told | None = None,
+    **more,
+) -> ModelSchedule:
+    """A gain schedule: models as of `identify_fmu` over a grid of one or two of the MVs, from steps up and down.
+
+    Raises:
+        InputError: as `identify_fmu`, and for a grid that is none.
+    """
+    if len(at) not in (1, 2):
+        raise InputError("--at", list(at), f"values of one or two of the MVs {', '.join(mvs)}")
+    for mv, values in at.items():
+        if mv not in mvs:
+            raise InputError("--at", mv, f"one of the MVs {', '.join(mvs)}", near(mv, mvs))
+        if len(values) < 2 or len(set(values)) != len(values):
+            raise InputError(f"--at {mv}", list(values), "two or more distinct values")
+    places = [dict(zip(at, values, strict=True)) for values in itertools.product(*at.values())]
+
+    def tests(place: Mapping[str, Value]) -> _Tests:
+        there = {mv: (place.get(mv, value), step) for mv, (value, step) in mvs.items()}
+        return _Tests(path, there, cvs, dt, samples, told=told, ways=("up", "down"), **more)
+
+    prepared = [tests(place) for place in places]  # all are checked before any is simulated
+    names = [one.channel for one in prepared[0].inputs if one.variable.name in at]
+    models = []
+    for number, one in enumerate(prepared, 1):
+        one.tell(f"working point {number} of {len(places)}")
+        models.append(one.identification().model)
+    return make_schedule(models, names)
+
+
+class _Tests:
+    """The tests of one working point; arguments as of `identify_fmu`."""
+
+    def __init__(
+        self, path, mvs, cvs, dt, samples, dvs=(), start=(), settle=None, time_limit=TIME_LIMIT,
+        told=None, ways=tuple(WAYS),
+    ):  # fmt: skip
+        if not is_count(samples) or samples < 2:
+            raise InputError("--samples", samples, "a whole number of 2 or more")
+        if not is_number(dt) or dt <= 0:
+            raise InputError("--dt", dt, "a positive sampling interval [s]")
+        if settle is not None and not (is_number(settle) and settle >= 0):
+            raise InputError("--settle", settle, "a number of seconds, 0 or more")
+        for option, given in (("--mv", mvs), ("--cv", cvs)):
+            if not given:
+                raise InputError(option, "nothing", "one or more variables, which jaxmpc fmu info lists")
+        self.path = Path(path)
+        self.dt, self.samples, self.given_settle, self._told = float(dt), samples, settle, told
+        self.notes: list[str] = []
+        self.start, self.ways = dict(start or {}), ways
+        given = {**mvs, **dict(dvs or {})}
+        twice = set(mvs) & set(dvs or ())
+        if twice:
+            raise InputError("--dv", min(twice), "a variable that is no MV")
+        with FmuProcess(path, time_limit) as fmu:
+            self.description: FmuDescription = fmu.description
+        channels = legal_names((*given, *cvs))
+        self.renamed = {c: name for name, c in channels.items() if c != name}
+        self.inputs: list[Moved] = []
+        for name, (value, step) in given.items():
+            option = "--mv" if name in mvs else "--dv"
+            value = self.start.get(name) if value is None else value
+            one, notes = moved(self.description, option, channels[name], name, value, step, self.ways)
+            self.inputs.append(one)
+            self.notes += notes
+        self.count, self.cvs = len(mvs), [channels[name] for name in cvs]
+        self.cv_variables = [self.description.variable("--cv", name) for name in cvs]
+        self.block = max(samples, SETTLE_SAMPLES)
+        self.plant_of = lambda settle: FmuPlant(
+            path,
+            [one.channel for one in self.inputs],
+            self.cvs,
+            dt=self.dt,
+            variables=self.renamed,
+            start=self.start,
+            working_point={one.channel: one.variable.nearest(one.rest) for one in self.inputs},
+            settle=settle,
+            stop_time=(settle + LONGEST * self.block * dt) + (samples + 1) * dt,
+            time_limit=time_limit,
+            description=self.description,
+        )
+        self.rest = np.array([one.rest for one in self.inputs])
+        self.plant_of(0.0)  # checked before anything is simulated
+
+    def tell(self, what: str) -> None:
+        """Say what is being done."""
+        if self._told is not None:
+            self._told(what)
+
+    # -------------------------------------------------------------------------------------------------------- the runs
+
+    def identification(self) -> Identification:
+        """Make all tests."""
+        settle = self.given_settle if self.given_settle is not None else self._settled()
+        with self.plant_of(settle) as plant:
+            return self._identified(plant, settle)
+
+    def _settled(self) -> float:
+        """How long the FMU takes until it stands still at the working point [s]."""
+        with self.plant_of(0.0) as plant:
+            first = plant.init().cv
+            record, length, slopes = [first], self.block, []
+            movement = still = np.zeros(len(self.cvs))
+            while len(record) <= LONGEST * self.block // 2:
+                self.tell(f"settling, {len(record) * self.dt:g} s simulated")
+                held = np.tile(self.rest, (length, 1))
+                cv, _ = apply_sequence(plant, None, held, np.zeros((length, 0)))
+                record.extend(cv)
+                run = np.array(record)
+                movement, noise = _movement(cv)
+                still = STILL * np.ptp(run, axis=0) + REPEATED * np.abs(run).max(axis=0) + 8 * noise
+                if (movement <= still).all():
+                    return (
+                        0.0
+                        if len(record) == length + 1 and _movement(run)[0].max() == 0
+                        else ((len(record) - 1) * self.dt)
+                    )
+                slopes.append(movement / length)
+                if (
+                    len(slopes) > 2
+                    and (np.array(slopes[-2:]) > GROWING * np.array(slopes[-3:-1])).all(axis=0).any()
+                ):
+                    i = int(np.argmax(slopes[-1] / np.maximum(slopes[-2], 1e-300)))
+                    self.notes.append(
+                        f"{self.cvs[i]} runs away at the working point: the steps are made from the start of the FMU on"
+                    )
+                    return 0.0
+                if len(slopes) > 2 and np.allclose(slopes[-1], slopes[-2], rtol=0.01):
+                    break  # it will go on like this
+                length = len(record) - 1
+        for i in np.flatnonzero(movement > still):
+            slope = 2 * movement[i] / (length * self.dt)
+            self.notes.append(
+                f"{self.cvs[i]} does not come to rest at the working point: it still moves by about {slope:.3g} per second "
+                f"after {(len(record) - 1) * self.dt:g} s. The responses are differences to a run without steps"
+            )
+        return (len(record) - 1) * self.dt
+
+    def _runs(self, plant: FmuPlant, mv: np.ndarray, count: int) -> Float[np.ndarray, "run sample cv"]:
+        """CVs of runs with held MVs from the working point on, the first sample before they act."""
+        runs = []
+        for _ in range(count):
+            first = plant.init().cv
+            cv, _ = apply_sequence(plant, None, np.tile(mv, (self.samples, 1)), np.zeros((self.samples, 0)))
+            runs.append(np.vstack([first, cv]))
+        return np.array(runs)
+
+    def _identified(self, plant: FmuPlant, settle: float) -> Identification:
+        self.tell("runs without steps")
+        still = self._runs(plant, self.rest, 2)
+        scale = np.abs(still).max(axis=(0, 1))
+        apart = np.abs(still[0] - still[1]).max(axis=0)
+        noise = np.where(apart > REPEATED * scale, (still[0] - still[1]).std(axis=0) / math.sqrt(2), 0.0)
+        shape = (len(self.cvs), len(self.inputs), self.samples)
+        responses = {way: np.full(shape, np.nan) for way in self.ways}
+        errors, changes = np.zeros(shape[:2]), np.zeros(shape[:2])
+        means: dict[tuple[int, str], np.ndarray] = {}
+        most = 2
+        for j, one in enumerate(self.inputs):
+            self.tell(f"steps of {one.channel}, input {j + 1} of {len(self.inputs)}")
+            counts = self._tested(plant, j, one, still.mean(axis=0), noise, settle, means)
+            most = max(most, counts)
+            errors[:, j] = noise / math.sqrt(counts) * error_of(one)
+        if noise.any() and most > 2:
+            self.tell("runs without steps, to average the noise")
+            still = np.concatenate([still, self._runs(plant, self.rest, most - 2)])
+        base = still.mean(axis=0) if noise.any() else still[0]
+        for (j, way), mean in means.items():
+            one = self.inputs[j]
+            change = mean - base
+            responses[way][:, j] = (change[1:] / (one.targets[way] - one.rest)).T
+            changes[:, j] = np.maximum(changes[:, j], np.abs(change).max(axis=0))
+        with np.errstate(all="ignore"):
+            pairs = np.stack([responses["up"], responses["down"]])
+            mean = np.where(np.isnan(pairs).any(axis=0), np.nansum(pairs, axis=0), pairs.mean(axis=0))
+        point = base.mean(axis=0) if noise.any() else base[0]
+        model = self._model(mean, point, settle, {})
+        seen = Tests(
+            model, responses, errors, changes, np.maximum(scale, changes.max(axis=1)), base,
+            [v.type in REALS for v in self.cv_variables],
+        )  # fmt: skip
+        verdicts, notes = judged(seen)
+        notes = (*self.notes, *self._noise_notes(noise, most), *notes)
+        silent = np.array([row.verdict == "none" for row in verdicts]).reshape(mean.shape[:2])
+        mean[silent] = 0.0
+        told = {"settled": not any("not settled" in row.says for row in verdicts)}
+        told |= {"verdicts": [list(row) for row in verdicts], "notes": list(notes)}
+        model = self._model(mean, point, settle, told)
+        return Identification(
+            model,
+            verdicts,
+            notes,
+            advice_of(verdicts, model),
+            bands=np.repeat(1.96 * errors[:, :, None], self.samples, axis=2) if noise.any() else None,
+            alternatives={way: found for way, found in responses.items() if np.isfinite(found).any()},
+            records=self._records(means, base, mean),
+        )
+
+    def _tested(self, plant, j, one, base, noise, settle, means) -> int:
+        """Make the tests of an input; returns how many runs each mean is of."""
+        total, count = {}, 1
+        for way, target in one.targets.items():
+            total[way] = self._runs(plant, self._stepped(j, target), 1)[0]
+        if noise.any():
+            count = self._repeats(one, total, base, noise, settle)
+            for way, target in one.targets.items():
+                more = count - 1 if "half" not in way else max(count // 4, 1) - 1
+                if more:
+                    self.tell(f"{one.channel} {way}: {more} more runs, to average the noise")
+                    again = self._runs(plant, self._stepped(j, target), more)
+                    total[way] = (total[way] + again.sum(axis=0)) / (more + 1)
+        means.update({(j, way): run for way, run in total.items()})
+        return count
+
+    def _stepped(self, j: int, target: float) -> np.ndarray:
+        mv = self.rest.copy()
+        mv[j] = target
+        return mv
+
+    def _repeats(self, one, total, base, noise, settle) -> int:
+        """How often a test is made, so that the mean of the noise is small beside the responses."""
+        smooth = max(self.samples // 10, 1)
+        kernel = np.ones(smooth) / smooth
+        need = 1.0
+        for i in np.flatnonzero(noise):
+            ways = [way for way in ("up", "down") if way in one.targets]
+            changes = [np.abs(np.convolve((total[w] - base)[1:, i], kernel, "valid")).max() for w in ways]
+            peak, error = max(changes), noise[i] * error_of(one) * abs(one.targets[ways[0]] - one.rest)
+            if peak > 5 * noise[i] / math.sqrt(smooth):
+                need = max(need, (error / (PRECISE * peak)) ** 2)
+        cost = len(one.targets) * (self.samples + settle / self.dt)
+        return int(min(math.ceil(need), MOST_REPEATS, max(MOST_SAMPLES / cost, 2)))
+
+    # ------------------------------------------------------------------------------------------------- what is returned
+
+    def _model(self, mean: np.ndarray, settled: np.ndarray, settle: float, told: dict) -> StepResponseModel:
+        path = self.path.resolve()
+        units = [one.variable.unit or "1" for one in self.inputs]
+        names = [one.channel for one in self.inputs]
+        point = dict(zip((*names, *self.cvs), (*self.rest.tolist(), *settled.tolist()), strict=True))
+        own = {one.variable.name: one.rest for one in self.inputs[self.count :]}
+        facts = {
+            "plant": "fmu",
+            "plant_hash": self.plant_of(settle).facts()["hash"],
+            "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            "fmu": str(path),
+            "fmu_hash": hashlib.sha256(path.read_bytes()).hexdigest(),
+            "variables": self.renamed,
+            "start": self.start | {n: self.description.variable("", n).nearest(x) for n, x in own.items()},
+            "settle": settle,
+            "stops": self.description.experiment["stop"] is not None,
+            "steps": {
+                one.channel: {way: to - one.rest for way, to in one.targets.items()} for one in self.inputs
+            },
+            "ranges": {
+                one.channel: list(one.variable.limits)
+                for one in self.inputs[: self.count]
+                if all(map(math.isfinite, one.variable.limits)) and one.variable.type not in BITS
+            },
+            "actuators": {
+                one.channel: how for one in self.inputs[: self.count] if (how := actuator_of(one.variable))
+            },
+        }
+        count = self.count
+        return make_model(
+            mean[:, :count], self.dt, self.cvs, names[:count],
+            cv_units=[v.unit or "1" for v in self.cv_variables], mv_units=units[:count],
+            working_point=point, provenance=facts | told,
+            dv_coefficients=mean[:, count:], dv_names=names[count:], dv_units=units[count:],
+        )  # fmt: skip
+
+    def _records(self, means: Mapping[tuple[int, str], np.ndarray], base, mean) -> tuple[Record, ...]:
+        out, times = [], np.arange(-1, self.samples + 1) * self.dt  # from the sample before the step on
+        for (j, way), run in means.items():
+            one = self.inputs[j]
+            change = one.targets[way] - one.rest
+            inputs = np.vstack(
+                [self.rest, np.tile(self._stepped(j, one.targets[way]), (self.samples + 1, 1))]
+            )
+            measured = np.vstack([base[0], run])
+            predicted = np.vstack([base[0], base]) + np.pad(change * mean[:, j].T, ((2, 0), (0, 0)))
+            unit = f" {one.variable.unit}" if one.variable.unit else ""
+            used = np.full(self.samples + 2, "half" not in way)
+            out.append(Record(f"{one.channel} {change:+.4g}{unit}", times, inputs, measured, predicted, used))
+        return tuple(out)
+
+    def _noise_notes(self, noise: np.ndarray, most: int) -> list[str]:
+        return [
+            f"{cv} has noise that differs from run to run, of standard deviation {sigma:.3g}: means of up to {most} runs"
+            for cv, sigma in zip(self.cvs, noise.tolist(), strict=True)
+            if sigma
+        ] + [
+            f"{name} is called {channel} here: a process file has names of letters, digits and '_'"
+            for channel, name in self.renamed.items()
+        ]
+
+
+def _movement(cv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """By how much the second half of a record differs from the first in the mean, and the error of that by noise."""
+    half = len(cv) // 2
+    movement = np.abs(cv[half:].mean(axis=0) - cv[:half].mean(axis=0))
+    noise = np.diff(cv, n=2, axis=0).std(axis=0) / math.sqrt(6)
+    return movement, noise * 2 / math.sqrt(len(cv)) / 2

@@ -1,0 +1,220 @@
+"""What step tests of several sizes, up and down, say of a model: a verdict on every pair of CV and input.
+
+`identify.fmu_steps` makes the tests. Every verdict is a sentence with numbers and units, and says what to do.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from identify.step_test import Settling, response_words, settling
+from jaxmpc.model.identification import PairVerdict, Verdict
+from jaxmpc.model.step_response import StepResponseModel
+
+NOTHING = 1e-7  # of the largest value of a CV: a change that is no response
+CURVED, BENT = (
+    0.05,
+    0.5,
+)  # of a response: differences of its tests from which on to look, and not to use the mean
+CONSTANT = 0.02  # of a slope: two that are one
+LEFT = 0.005  # of a response: error by noise from which on to look
+FAST = 3  # samples to 63 % of a gain
+
+
+class Tests(NamedTuple):
+    """What was measured.
+
+    Attributes:
+        model: the mean of full steps up and down.
+        responses: by test, ``up``, ``down``, ``half up``, ``half down``; NaN where a test was not made.
+        errors: standard errors of the coefficients by noise that differs from run to run.
+        changes: largest change of a CV in the tests of an input [CV unit].
+        scale: largest value of a CV [CV unit].
+        base: without steps.
+        continuous: whether a CV takes every value.
+    """
+
+    model: StepResponseModel
+    responses: Mapping[str, Float[np.ndarray, "cv input n"]]
+    errors: Float[np.ndarray, "cv input"]
+    changes: Float[np.ndarray, "cv input"]
+    scale: Float[np.ndarray, " cv"]
+    base: Float[np.ndarray, "sample cv"]
+    continuous: Sequence[bool]
+
+
+def judged(tests: Tests) -> tuple[tuple[PairVerdict, ...], list[str]]:
+    """A verdict per pair, CV by CV, and notes on CVs and inputs that show nothing at all."""
+    model, found, notes = tests.model, [], []
+    inputs = (*model.mv_names, *model.dv_names)
+    rows = {(row.cv, row.mv): row for row in settling(_smoothed(tests))}
+    for i, cv in enumerate(model.cv_names):
+        for j, name in enumerate(inputs):
+            found.append(PairVerdict(cv, name, *_pair(tests, i, j, rows[cv, name])))
+    for name in inputs:
+        if all(row.verdict == "none" for row in found if row.input == name):
+            notes.append(f"{name} has no effect on any CV: leave it out, or look at where the model uses it")
+    for i, cv in enumerate(model.cv_names):
+        if all(row.verdict == "none" for row in found if row.cv == cv):
+            still = not np.ptp(tests.base[:, i])
+            how = f"stays at {tests.base[0, i]:.6g}" if still else "moves by itself only"
+            notes.append(f"{cv} answers to no input: it {how}; choose another CV")
+    return tuple(found), notes
+
+
+def _smoothed(tests: Tests) -> StepResponseModel:
+    """The model without the noise that would hide whether it has settled."""
+    model = tests.model
+    width = model.samples // 20
+    if not tests.errors.any() or width < 2:
+        return model
+    kernel = np.ones(width) / width
+
+    def smooth(s: Any) -> Any:
+        filled = np.pad(np.asarray(s), ((0, 0), (0, 0), (width // 2, width - 1 - width // 2)), mode="edge")
+        return np.apply_along_axis(np.convolve, 2, filled, kernel, "valid") if np.size(s) else s
+
+    return dataclasses.replace(
+        model, coefficients=smooth(model.coefficients), dv_coefficients=smooth(model.dv_coefficients)
+    )
+
+
+def _pair(tests: Tests, i: int, j: int, row: Settling) -> tuple[Verdict, str]:
+    model = tests.model
+    s = np.concatenate([np.asarray(model.coefficients), np.asarray(model.dv_coefficients)], axis=1)[i, j]
+    cv_unit, unit = model.cv_units[i], (*model.mv_units, *model.dv_units)[j]
+    per = "" if cv_unit == unit == "1" else f" {cv_unit} per {unit}".replace(" 1 per", " per")
+    tested = np.stack([found[i, j] for found in tests.responses.values() if np.isfinite(found[i, j]).all()])
+    error, peak = float(tests.errors[i, j]), float(np.abs(tested).max())
+    expected_peak = error * math.sqrt(2 * math.log(2 * len(s) + 1))  # of noise alone
+    if tests.changes[i, j] <= NOTHING * tests.scale[i] or (
+        error and not _stands_out(s, error, expected_peak)
+    ):
+        return "none", f"no response: at most {np.abs(s).max():.3g}{per}" + (
+            " within the noise" if error else ""
+        )
+    words, looks = response_words(row, s, per, model.dt), []
+    runaway, says = _moving(s, row, model.dt, per, error)
+    looks += [says] if says else []
+    share = 1.96 * error / peak
+    if share > LEFT:
+        looks.append(f"noise leaves +-{100 * share:.2g} % of its largest value: larger steps leave less")
+    if not tests.continuous[i]:
+        looks.append(
+            f"{row.cv} takes whole values only: this is its answer to steps of this size and to no other"
+        )
+    alone = _drift(tests.base[:, i])
+    if alone > CURVED * tests.changes[i, j]:
+        looks.append(
+            f"without a step it moves by {alone:.3g} {cv_unit} in the same time: the response is the difference of both, "
+            "which is right where the plant is linear; let it settle longer (--settle), or look at what drives it"
+        )
+    verdict: Verdict = "bad" if runaway else "look" if looks else "good"
+    apart, says = _sizes(tests, i, j, peak, error)
+    if apart > CURVED:
+        looks.append(says)
+        verdict = "bad" if apart > BENT or runaway else "look"
+    if not looks and row.settled and _rise(s, row.gain) < FAST:
+        words += "; it is there within 3 samples: what it does in between is not seen"
+    return verdict, "; ".join([words, *looks])
+
+
+def _stands_out(s: np.ndarray, error: float, expected: float) -> bool:
+    """Whether a response is more than noise: in one sample, or in the mean of its last quarter."""
+    tail = s[-max(len(s) // 4, 1) :]
+    return bool(np.abs(s).max() > 1.5 * expected or abs(tail.mean()) > 5 * error / math.sqrt(len(tail)))
+
+
+def _drift(base: np.ndarray) -> float:
+    """By how much a CV moves without a step, beyond noise."""
+    half = len(base) // 2
+    noise = np.diff(base, n=2).std() / math.sqrt(6 * half) if half > 1 else 0.0
+    return max(abs(base[-half:].mean() - base[:half].mean()) * 2 - 12 * noise, 0.0)
+
+
+def _moving(s: np.ndarray, row: Settling, dt: float, per: str, error: float) -> tuple[bool, str]:
+    """Whether a response runs away, and what is to be said of one that still moves at its end."""
+    if row.settled or len(s) < 8:
+        return False, "" if row.settled else f"not settled by sample {len(s)}: give more samples"
+    quarter = len(s) // 4
+    ends = [len(s) - k * quarter for k in (2, 1, 0)]
+    slopes = [np.polyfit(np.arange(quarter) * dt, s[end - quarter : end], 1)[0] for end in ends]
+    doubt = 3 * error * math.sqrt(12 / quarter**3) / dt
+    first, before, last = map(float, slopes)
+    if error and abs(last) <= doubt:
+        return False, ""
+    if abs(last - before) <= CONSTANT * abs(last) + doubt:
+        return False, (
+            f"it integrates: at the end it moves {last:.4g}{per} each second, for ever; the prediction holds the last "
+            "value, so control it with a horizon within the model, or take a CV that settles"
+        )
+    if last * before > 0 and abs(last) > abs(before):
+        if before * first > 0 and last / before > 0.9 * before / first > 0.9:
+            return (
+                True,
+                "it runs away, faster and faster: it is unstable, and a step response cannot model that; stabilise it first",
+            )
+        return False, f"not settled by sample {len(s)}, and still faster and faster: give more samples"
+    left = -math.log(0.01) * quarter / max(math.log(max(abs(before), 1e-300) / max(abs(last), 1e-300)), 1e-3)
+    more = f"; about {math.ceil(left / 50) * 50:d} samples would show it all" if 0 < left < 1e5 else ""
+    return False, f"not settled by sample {len(s)}: it still moves {last:.3g}{per} each second{more}"
+
+
+def _sizes(tests: Tests, i: int, j: int, peak: float, error: float) -> tuple[float, str]:
+    """The largest difference of tests as a share of the response, beyond what noise makes, and words for it."""
+    tested = {way: found[i, j] for way, found in tests.responses.items() if np.isfinite(found[i, j]).all()}
+    halves = [found for way, found in tested.items() if "half" in way]
+    fulls = [found for way, found in tested.items() if "half" not in way]
+    noise = error * math.sqrt(2 * math.log(2 * tests.model.samples + 1)) * 1.5
+    worst, says = 0.0, ""
+    if len(fulls) == 2:
+        apart = max(np.abs(fulls[0] - fulls[1]).max() - 2 * noise, 0.0) / peak
+        up, down = float(fulls[0][-1]), float(fulls[1][-1])
+        worst, says = (
+            apart,
+            (
+                f"a step up and one down differ by {100 * apart:.3g} %: gain {up:.4g} up, {down:.4g} down; smaller steps, "
+                "or a gain schedule (--at)"
+            ),
+        )
+    if halves:
+        apart = max(np.abs(np.mean(halves, axis=0) - np.mean(fulls, axis=0)).max() - 4 * noise, 0.0) / peak
+        if apart > worst:
+            worst, says = (
+                apart,
+                (
+                    f"steps of half the size differ by {100 * apart:.3g} %: gain {float(np.mean(halves, axis=0)[-1]):.4g}; "
+                    "step as far as the controller will move it"
+                ),
+            )
+    return worst, says
+
+
+def _rise(s: np.ndarray, gain: float) -> int:
+    """Samples to 63 % of a gain."""
+    begin = int(np.argmax(np.abs(s) > 0.02 * np.abs(s).max()))
+    return int(np.argmax(s * np.sign(gain) >= 0.63 * abs(gain))) + 1 - begin
+
+
+def advice_of(verdicts: Sequence[PairVerdict], model: StepResponseModel) -> tuple[str, ...]:
+    """What to do next, the most useful first."""
+    says = " ".join(row.says for row in verdicts)
+    found = []
+    bad = [f"{row.input} on {row.cv}" for row in verdicts if row.verdict == "bad"]
+    if bad:
+        found.append(f"Do not use {', '.join(bad)} as it is: its verdict says why, and what to do.")
+    if "would show it all" in says or "give more samples" in says:
+        found.append(
+            f"Give more samples than {model.samples} (--samples), or a longer sampling interval (--dt)."
+        )
+    if "noise leaves" in says:
+        found.append("Give larger steps (--mv NAME=VALUE:STEP), which the noise hides less.")
+    if "it integrates" in says:
+        found.append("Leave out CVs that integrate, or control them with a horizon that the model covers.")
+    return tuple(found)
