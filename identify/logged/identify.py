@@ -93,7 +93,7 @@ def identify_log(
     for name in cv:
         if np.nanstd(log.values[name]) == 0:
             raise InputError(f"column {name}", float(np.nanmean(log.values[name])), "a CV that changes")
-    cut = int(round((1 - HELD_OUT) * len(log.times)))
+    cut = round((1 - HELD_OUT) * len(log.times))
     all_data = {name: make_data(log.values[name], signals[:, moving], log.segments) for name in cv}
     notes = list(log.notes)
     with tqdm(
@@ -154,7 +154,7 @@ def _length(all_data: dict[str, Data], cut: int, log: Log, bar: tqdm, notes: lis
 
 def _settled(data: Data, length: int) -> int:
     """Samples after which the responses of a CV stay where they end, as far as the data tell."""
-    fit = search(data, length)
+    fit = search(data, length, roughly=True)
     steps, doubt = fit.steps(data), bands(data, fit)
     known = np.abs(steps).max(axis=1) > doubt.max(axis=1)
     slowest = 1.0
@@ -268,8 +268,8 @@ def _method_notes(
 ) -> list[str]:
     kept = len(log.times) - cut
     notes = [
-        f"the first {cut} samples made a first model, which was judged on the last {kept}; then all made the model in the file, "
-        "and the predictions that are drawn are those of the first",
+        f"the first {cut} samples made a first model, which was judged on the last {kept}; then all made the model in the "
+        "file, and the predictions that are drawn are those of the first",
         "before each segment the inputs were taken to have stood at their first values",
     ]
     for name, own in found.items():
@@ -294,10 +294,9 @@ def _method_notes(
         fed = [j for j in range(len(inputs)) if own.tested.feedback[j] > own.tested.limit]
         if fed:
             names = ", ".join(inputs[j] for j in fed)
-            words = f"{name}: {names} follow its residuals: a controller or an operator closed the loop while this was logged, "
+            words = f"{name}: later moves of {names} follow its residuals: a controller or an operator closed the loop. "
             notes.append(
-                words
-                + "and with feedback the responses may be biased; moves that do not depend on it tell more"
+                f"{words}Feedback may bias the responses; moves that do not depend on the CV tell more"
             )
     return notes
 

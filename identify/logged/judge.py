@@ -100,8 +100,8 @@ def verdict_of(
         if half * excited.moved <= NOTHING * cv_range:
             words = f"no response: 0 within ±{half:.3g} {per}, so that moves of {span} change {cv} by "
             return PairVerdict(cv, name, "none", words + f"{amount(half * excited.moved, cv_unit)} at most")
-        words = f"cannot tell: {steps[-1]:.3g} ± {half:.3g} {per}, zero within the band; larger or more moves of {name} are needed"
-        return PairVerdict(cv, name, "bad", words)
+        words = f"cannot tell: {steps[-1]:.3g} ± {half:.3g} {per}, zero within the band; "
+        return PairVerdict(cv, name, "bad", f"{words}larger or more moves of {name} are needed")
     share = half / peak
     gain = f"gain {steps[-1]:.4g} ± {band[-1]:.2g} {per}"
     if share > USABLE:

@@ -1,9 +1,9 @@
 """Impulse responses by regularised least squares: kernels per pair whose hyperparameters maximise the marginal likelihood.
 
-The impulse response of a pair is Gaussian with the covariance ``b exp(-(i + k) / 2 tau) exp(-|i - k| / kappa)``, the diagonal-correlated
-kernel (Chen, Ohlsson & Ljung 2012, DC); for ``kappa = 2 tau`` it is the tuned-correlated one, TC. Its Cholesky factor is known in
-closed form, so that nothing ill-conditioned is ever factored. The variance of the noise is eliminated; what is maximised
-is the likelihood of the data with all responses integrated out (Pillonetto et al. 2014, section 4).
+The impulse response of a pair is Gaussian with the covariance ``b exp(-(i + k) / 2 tau) exp(-|i - k| / kappa)``, the
+diagonal-correlated kernel (Chen, Ohlsson & Ljung 2012, DC); for ``kappa = 2 tau`` it is the tuned-correlated one, TC. Its
+Cholesky factor is known in closed form, so that nothing ill-conditioned is ever factored. The variance of the noise is
+eliminated; what is maximised is the likelihood of the data with all responses integrated out (Pillonetto et al. 2014).
 """
 
 from __future__ import annotations
@@ -128,9 +128,11 @@ def estimate(
             for tau, amount in SCREENED
         ]
         tried = np.repeat(np.clip(each, low, high)[:, None], size, axis=1)
-        start = tried[int(np.argmin(_screened(jnp.asarray(tried), *arrays)))][:inputs]
+        begin = tried[int(np.argmin(_screened(jnp.asarray(tried), *arrays)))][:inputs]
+    else:
+        begin = start
     x = np.zeros((size, 3))
-    x[:inputs] = np.clip(start, low, high)
+    x[:inputs] = np.clip(begin, low, high)
 
     def value(free: np.ndarray) -> tuple[float, np.ndarray]:
         x[:inputs] = free.reshape(inputs, 3)
@@ -138,7 +140,7 @@ def estimate(
         return float(found), np.asarray(slope)[:inputs].ravel()
 
     if iterations:
-        options = {"maxiter": iterations, "ftol": 1e-8}
+        options = {"maxiter": iterations, "ftol": 1e-6}
         found = minimize(
             value, x[:inputs].ravel(), jac=True, method="L-BFGS-B", bounds=bounds * inputs, options=options
         )

@@ -1,12 +1,13 @@
 """A log on a regular grid: what `read_log` makes of a file, with everything that it did to the data said.
 
-Inputs (MVs, DVs) are held: at a sample stands the last value that was logged. CVs are the mean of what was logged within half a
-sample around it, and missing where there is nothing. Where the log has a gap a new segment begins; nothing is bridged.
+Inputs (MVs, DVs) are held: at a sample stands the last value that was logged. CVs are the mean of what was logged within half
+a sample around it, and missing where there is nothing. Where the log has a gap a new segment begins; nothing is bridged.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
@@ -70,7 +71,8 @@ def read_log(
         path: of the file; a row of names, perhaps a row of units, then rows of values.
         columns: names of the columns that are read.
         dt: sampling interval [s]; the median of the log's own by default.
-        time: column of the times; by default the first, or one called time, date or the like. Without any, rows are `dt` apart.
+        time: column of the times; by default the first, or one called time, date or the like. Without any, rows are `dt`
+            apart.
         held: those of the columns that are inputs.
 
     Raises:
@@ -171,7 +173,7 @@ def _tell_of_intervals(stamps: np.ndarray, typical: float, dt: float, pieces: li
             f"{100 * uneven:.2g} % of the intervals differ from the median of {typical:g} s by more than a tenth"
         )
     if len(pieces) > 1:
-        longest = max(stamps[b[0]] - stamps[a[-1]] for a, b in zip(pieces[:-1], pieces[1:], strict=True))
+        longest = max(stamps[b[0]] - stamps[a[-1]] for a, b in itertools.pairwise(pieces))
         notes.append(
             f"{len(pieces) - 1} gaps (up to {longest:g} s) part the log into segments; none is bridged"
         )

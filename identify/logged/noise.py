@@ -1,9 +1,9 @@
-"""Noise of a log: white noise of the measurement and a disturbance that drifts, and how both are taken out of a regression.
+"""Noise of a log, white noise of the measurement and a disturbance that drifts, and how both leave a regression.
 
-A CV is what the inputs do plus ``v(t) = x(t) + w(t)``, ``x(t+1) = phi x(t) + e(t)``, with variances of ``w`` and ``e`` in the ratio
-1 to ``drift``. The Kalman filter of ``x`` turns rows of a regression into rows with independent errors, also where
-measurements are missing, for its gains depend on neither (Ljung 1999, 4.3; Harvey 1989, 3.4). For ``phi = 1`` the disturbance is
-a random walk, the differenced or integrated-noise model.
+A CV is what the inputs do plus ``v(t) = x(t) + w(t)``, ``x(t+1) = phi x(t) + e(t)``, the variances of ``w`` and ``e`` in the
+ratio 1 to ``drift``. The Kalman filter of ``x`` turns rows of a regression into rows with independent errors, also where
+measurements are missing, for its gains are the same for all columns (Harvey 1989, section 3.4). For ``phi = 1`` the
+disturbance is a random walk, the differenced or integrated-noise model.
 """
 
 from __future__ import annotations

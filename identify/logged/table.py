@@ -19,10 +19,10 @@ from jaxtyping import Float
 from identify.logged.stamps import is_stamp, seconds
 from jaxmpc.errors import InputError, near
 
-MISSING = frozenset(
-    ["nan", "na", "n/a", "null", "none", "bad", "-", "--", "---", "?", "no_data", "nodata", "invalid", "questionable", "uncertain", "offline", "error", "shutdown", "comm_fail"]
-) | {
-    "",
+WORDS = (
+    "nan na n/a null none bad - -- --- ? no_data nodata invalid questionable uncertain offline error shutdown"
+)
+SENTENCES = (
     "no data",
     "bad input",
     "i/o timeout",
@@ -31,7 +31,8 @@ MISSING = frozenset(
     "pt created",
     "out of serv",
     "#n/a",
-}
+)
+MISSING = frozenset(("", *WORDS.split(), *SENTENCES))
 UNIT = re.compile(r"^(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))$")  # NAME [UNIT] or NAME (UNIT)
 GROUPED = re.compile(r"^[+-]?\d{1,3}(\.\d{3})*(,\d+)?([eE][+-]?\d+)?$|^[+-]?\d*,?\d+([eE][+-]?\d+)?$")
 

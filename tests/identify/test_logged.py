@@ -58,7 +58,7 @@ def verdicts(found):
 def test_responses_are_exact_without_noise(tmp_path, moves):
     truth = [[FIRST, SECOND], [INVERSE, NOTHING]]
     y = np.stack([sum(response(f, u) for f, u in zip(row, moves.T, strict=True)) for row in truth], axis=1)
-    path = log_file(tmp_path / "log.csv", moves + 50, y + [80.0, 3.0], then=("y", "z"))
+    path = log_file(tmp_path / "log.csv", moves + 50, y + np.array([80.0, 3.0]), then=("y", "z"))
     found = identify_log(path, ["a"], ["y", "z"], ["b"], samples=LENGTH)
     exact = np.array([[coefficients(f) for f in row] for row in truth])
     # 0.5 % of the largest coefficient; what the plant still does after N samples is 5e-5 of it
@@ -228,7 +228,7 @@ def test_what_the_data_cannot_tell_is_not_said_to_be_nothing(tmp_path, moves):
 def test_inputs_that_move_together_are_refused(tmp_path, moves):
     u = np.column_stack([moves[:, 0], 3 * moves[:, 0] + 1])
     path = log_file(tmp_path / "log.csv", u, response(FIRST, u[:, 0]))
-    with pytest.raises(InputError, match="a moves like b .* cannot tell which"):
+    with pytest.raises(InputError, match=r"a moves like b .* cannot tell which"):
         identify_log(path, ["a", "b"], ["y"], samples=LENGTH)
 
 
