@@ -27,10 +27,7 @@ from jaxmpc.model.identification import Identification, PairVerdict, Record
 from jaxmpc.model.step_response import make_model
 
 HELD_OUT = 0.27  # share of the samples that the first fit does not see
-TRIED, COLUMNS = (
-    (32, 64, 128, 192),
-    600,
-)  # lags of first fits where N is not given; most of all inputs together
+TRIED, COLUMNS = (32, 64, 128), 384  # lags of first fits where N is not given; most of all inputs
 ROOM = 0.7  # of the lags of a first fit, in which it settles
 MARGIN, SHORTEST = 1.25, 10  # N over the settling time of the first fit; least N
 SETTLED, LAGS = 0.003, 5.8  # of the largest coefficient: settled; so many lags of a first order

@@ -134,4 +134,6 @@ def innovations(noise: Noise, series: Float[np.ndarray, " sample"]) -> Float[np.
         filled = np.where(known, series - series[known].mean(), 0.0)[:, None]
         rows = [block for block, _ in whitened(noise, iter([filled]), known)]
         out[known] = np.concatenate(rows)[:, 0]
+        if noise.drift:
+            out[np.argmax(known)] = np.nan  # of where the drift begins nothing is known
     return out

@@ -1,8 +1,8 @@
 """The regression of a CV on past inputs, as sums of squares whose size does not depend on the length of the log.
 
 ``y(t) = c + sum_j sum_k g_j(k) u_j(t-k) + v(t)``, k = 1..N, per segment an own offset c. Before a segment the inputs are
-taken to have stood at their first values; what they did otherwise shows in the first N samples as a free response, for which each
-segment may get columns of its own: tents on knots that lie closer where it begins. Offsets and free responses are
+taken to have stood at their first values; what they did otherwise shows in the first N samples as a free response, for which
+each segment may get columns of its own: tents on knots that lie closer where it begins. Offsets and free responses are
 eliminated segment by segment (Schur complements), so that sums over the impulse responses alone remain.
 """
 
