@@ -110,9 +110,11 @@ def identify_log(
     if all(row.verdict == "bad" for row in verdicts):
         reasons = "; ".join(dict.fromkeys(row.says for row in verdicts))
         raise InputError("data", str(path), "moves that tell at least one response", reasons)
+    silent = np.array([row.verdict == "none" for row in verdicts]).reshape(len(cv), len(inputs), 1)
+    steps = np.where(silent, 0.0, np.stack([found[name].steps for name in cv]))
     notes += _method_notes(log, found, inputs, samples, cut)
     return Identification(
-        _model(path, log, mv, cv, dv, found, samples, verdicts, notes),
+        _model(path, log, mv, cv, dv, steps, verdicts, notes),
         verdicts,
         tuple(notes),
         _advice(verdicts, log, samples),
@@ -151,7 +153,7 @@ def _length(all_data: dict[str, Data], cut: int, log: Log, bar: tqdm, notes: lis
 
 def _settled(data: Data, length: int) -> int:
     """Samples after which the responses of a CV stay where they end, as far as the data tell."""
-    fit = search(data, length, roughly=True)
+    fit = search(data, length)
     steps, doubt = fit.steps(data), bands(data, fit)
     known = np.abs(steps).max(axis=1) > doubt.max(axis=1)
     slowest = 1.0
@@ -313,8 +315,7 @@ def _advice(verdicts: Sequence[PairVerdict], log: Log, samples: int) -> tuple[st
     return tuple(out)
 
 
-def _model(path, log: Log, mv, cv, dv, found: dict[str, _Cv], samples: int, verdicts, notes):
-    steps = np.stack([found[name].steps for name in cv])
+def _model(path, log: Log, mv, cv, dv, steps: np.ndarray, verdicts, notes):
     units = lambda names: [log.units.get(name, "1") for name in names] if log.units else ()  # noqa: E731
     point = {name: float(np.round(np.nanmedian(log.values[name]), 12)) for name in (*mv, *cv)}
     facts = {
@@ -323,7 +324,6 @@ def _model(path, log: Log, mv, cv, dv, found: dict[str, _Cv], samples: int, verd
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "begin": log.begin,
         "samples_used": len(log.times),
-        "fit": {name: round(float(found[name].fit), 2) for name in cv},
         "verdicts": [list(row) for row in verdicts],
         "notes": list(notes),
     }

@@ -1,7 +1,7 @@
 """A log on a regular grid: what `read_log` makes of a file, with everything that it did to the data said.
 
 Inputs (MVs, DVs) are held: at a sample stands the last value that was logged. CVs are the mean of what was logged within
-half a sample around it, and missing where there is nothing. Where the log has a gap a new segment begins; nothing is bridged.
+half a sample around it, and missing where there is nothing. A gap in the log begins a new segment; nothing is bridged.
 """
 
 from __future__ import annotations

@@ -11,7 +11,9 @@ from identify.logged.kernel import Posterior, estimate, factors
 from identify.logged.low_order import low_order
 from identify.logged.noise import Noise, likeliest, whitened
 from identify.logged.regression import Segment, sums
+from jaxmpc.cli import main as cli
 from jaxmpc.errors import InputError
+from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.model.transfer_function import TransferFunction
 
 COUNT, LENGTH = 900, 60  # samples; N: all fits of this file are of the sizes of two or three programs
@@ -69,6 +71,7 @@ def test_responses_are_exact_without_noise(tmp_path, moves):
     assert [tuple(row) for row in dict(found.model.provenance)["verdicts"]] == [
         tuple(v) for v in found.verdicts
     ]
+    assert not found.responses[1, 1].any()
     (record,) = found.records
     assert record.used.sum() == round(0.73 * COUNT)
     np.testing.assert_allclose(record.predicted, record.measured, atol=0.05)
@@ -286,3 +289,23 @@ def test_the_evidence_of_a_fit_does_not_depend_on_the_order_of_its_inputs(moves)
     swapped = dataclasses.replace(start, posterior=turned)
     other = fitted(make_data(y, moves[:, ::-1], [slice(0, COUNT)]), LENGTH, swapped, 0)
     assert other.posterior.score == pytest.approx(start.posterior.score, rel=1e-9)
+
+
+def test_the_command_writes_a_model_and_a_page_and_refuses_what_is_for_fmus(tmp_path, moves, capsys):
+    rng = np.random.default_rng(9)
+    y = response(FIRST, moves[:, 0]) + response(SECOND, moves[:, 1]) + 0.1 * rng.normal(size=COUNT)
+    path, out = log_file(tmp_path / "log.csv", moves, y), tmp_path / "made.json"
+    words = ["identify", str(path), "--mv", "a", "--dv", "b", "--cv", "y", "--samples", str(LENGTH)]
+    assert cli.main([*words, "--out", str(out)]) == 0
+    shown = capsys.readouterr().out
+    assert "good" in shown
+    assert f"Next: jaxmpc process new --model {out}" in shown
+    model = StepResponseModel.load(out)
+    assert (model.mv_names, model.dv_names, model.samples) == (("a",), ("b",), LENGTH)
+    assert hash(model.provenance)  # programs know it
+    assert "<html" in out.with_suffix(".html").read_text()
+    out.unlink()
+    for wrong in (["--settle", "10"], ["--mv", "c=3"], ["--dt", "-1"]):
+        assert cli.main([*words, *wrong, "--out", str(out)]) == 2
+        assert wrong[0] in capsys.readouterr().err
+    assert not out.exists()
