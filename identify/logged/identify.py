@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from identify.logged.fit import Data, Fit, bands, climbing, fitted, make_data, residuals, search, simulated
 from identify.logged.judge import excitations, verdict_of
-from identify.logged.log import Log, read_log
+from identify.logged.log import LEAST, Log, read_log
 from identify.logged.low_order import LowOrder, low_order
 from identify.logged.noise import innovations
 from identify.logged.residuals import Residuals, examined
@@ -91,6 +91,11 @@ def identify_log(
         if np.nanstd(log.values[name]) == 0:
             raise InputError(f"column {name}", float(np.nanmean(log.values[name])), "a CV that changes")
     cut = round((1 - HELD_OUT) * len(log.times))
+    for name in cv:
+        known = int(np.isfinite(log.values[name][:cut]).sum())
+        if known < LEAST:
+            expected = f"at least {LEAST} values in the first {100 * (1 - HELD_OUT):.0f} % of the log"
+            raise InputError(f"column {name}", f"{known} values", expected)
     all_data = {name: make_data(log.values[name], signals[:, moving], log.segments) for name in cv}
     notes = list(log.notes)
     with tqdm(

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from figures.identification import write_page
 from identify.logged import identify_log
 from identify.logged.fit import bands, fitted, make_data, search, simulated
 from identify.logged.kernel import Posterior, estimate, factors
@@ -226,6 +227,7 @@ def test_what_the_data_cannot_tell_is_not_said_to_be_nothing(tmp_path, moves):
     assert "never moves" in says["still"][1]
     assert np.isnan(found.bands[0, 3]).all()
     assert found.advice[0].startswith("Step small, still")
+    assert "never moves" in write_page(found, tmp_path / "page.html").read_text()
 
 
 def test_inputs_that_move_together_are_refused(tmp_path, moves):
@@ -309,3 +311,10 @@ def test_the_command_writes_a_model_and_a_page_and_refuses_what_is_for_fmus(tmp_
         assert cli.main([*words, *wrong, "--out", str(out)]) == 2
         assert wrong[0] in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_a_cv_with_hardly_any_value_is_refused(tmp_path, moves):
+    y = np.where(np.arange(COUNT) % 100 == 0, moves[:, 0], np.nan)
+    path = log_file(tmp_path / "log.csv", moves, y)
+    with pytest.raises(InputError, match="column y: got '7 values'"):
+        identify_log(path, ["a"], ["y"], samples=LENGTH)
