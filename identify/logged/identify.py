@@ -38,7 +38,6 @@ class _Cv(NamedTuple):
     """What was found for one CV, responses with all inputs, those that never move at 0."""
 
     data: Data
-    trained: Fit
     final: Fit
     fit: float  # % of the part that was left out
     low_fit: float  # % by the low-order responses
@@ -164,9 +163,8 @@ def _settled(data: Data, length: int) -> int:
     slowest = 1.0
     for s, band in zip(steps[known], doubt[known], strict=True):
         low = low_order(s, band, integrating=fit.integrating)
-        slowest = max(
-            slowest, low.dead_time + LAGS * low.lag
-        )  # noise hides where a response ends, not how fast it is
+        # noise hides where a response ends, not how fast it is
+        slowest = max(slowest, low.dead_time + LAGS * low.lag)
         if fit.integrating:  # its rate settles
             s, band = np.diff(s, prepend=0.0), np.abs(np.diff(band, prepend=0.0))
         outside = np.abs(s - s[-1]) > SETTLED * np.abs(s).max() + 0.5 * band
@@ -187,28 +185,13 @@ def _identified(data: Data, length: int, cut: int, signals: np.ndarray, moving: 
     alone = whole(trained)
     rough = _replaced(trained, data, bands(training, trained))
     errors = np.concatenate([innovations(final.noise, left) for left in residuals(data, final)])
-    every = np.full(len(data.output), np.nan)
-    for own, part in zip(
-        data.segments, np.split(errors, [own.stop for own in data.segments][:-1]), strict=True
-    ):
-        every[own] = part
     low: list[LowOrder | None] = [
         low_order(s, b, integrating=final.integrating) if m else None
         for s, b, m in zip(steps, band, moving, strict=True)
     ]
-    tested = examined(every, signals, data.segments, length)
-    return _Cv(
-        data,
-        trained,
-        final,
-        _fit(data, alone, cut),
-        _fit(data, whole(rough), cut),
-        low,
-        steps,
-        band,
-        alone,
-        tested,
-    )
+    tested = examined(errors, signals, data.segments, length)
+    fits = _fit(data, alone, cut), _fit(data, whole(rough), cut)
+    return _Cv(data, final, *fits, low, steps, band, alone, tested)
 
 
 def _replaced(fit: Fit, data: Data, band: np.ndarray) -> Fit:
