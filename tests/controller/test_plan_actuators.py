@@ -136,7 +136,8 @@ def test_a_pump_stays_on_or_off_for_its_dwell_and_remembers_the_past():
 
 
 def test_past_moves_count_for_the_dwell():
-    case = make_case(on_off())
+    # on for four samples: no other plan costs as little
+    case = make_case(on_off() | {"setpoint": [[1.0]] * 4 + [[0.0]] * 4})
     planner = Planner(case.structure, case.tuning, case.model)
     given = {key: getattr(case, key) for key in ("mv_now", "last_move", "free_response", "setpoint")}
     plan = planner.solve(**given, past_moves=np.array([[1.0], [-1.0], [0.0]]))
