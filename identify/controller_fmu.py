@@ -49,10 +49,7 @@ def build_controller_fmu(
     """
     if not isinstance(controller, Controller):
         raise InputError("controller", type(controller).__name__, "a Controller, without targets of MVs")
-    path = Path(path)
-    if path.suffix != ".fmu":
-        raise InputError("out", str(path), "the path of a file that ends in .fmu")
-    check_target("out", path)
+    path = check_fmu_target("path", path)
     starts = _checked_start(controller, dict(start or {}))
     try:
         from pythonfmu import FmuBuilder
@@ -66,6 +63,14 @@ def build_controller_fmu(
         files[1].write_text(json.dumps(starts))
         built = FmuBuilder.build_FMU(PROGRAM, dest=folder / "controller.fmu", project_files=files)
         return write_atomically(path, Path(built).read_bytes())
+
+
+def check_fmu_target(field: str, path: str | Path) -> Path:
+    """The path of an FMU that can be written; errors of `check_target`."""
+    if Path(path).suffix != ".fmu":
+        raise InputError(field, str(path), "the path of a file that ends in .fmu")
+    check_target(field, path)
+    return Path(path)
 
 
 def _checked_start(controller: Controller, given: dict[str, float]) -> dict[str, float]:

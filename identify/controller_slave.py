@@ -90,11 +90,13 @@ def leave_soundly(folder: Path) -> None:
 
     Only where the process is one of Python: elsewhere this state is what keeps Python running.
     """
+    if sys.platform != "linux" or not sys.orig_argv:
+        return
     for library in (folder.parent / "binaries" / "linux64").glob("*.so"):
-        if sys.orig_argv:
-            forget = getattr(ctypes.CDLL(str(library), os.RTLD_NOLOAD), "finalizePythonInterpreter", None)
-            if forget is not None:
-                atexit.register(forget)
+        with contextlib.suppress(
+            OSError, AttributeError
+        ):  # not loaded, as in a test; or without this function
+            atexit.register(ctypes.CDLL(str(library), os.RTLD_NOLOAD).finalizePythonInterpreter)
 
 
 class JaxmpcController(Fmi2Slave):

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, choice, command, option
 from jaxmpc.errors import InputError
-from jaxmpc.files import check_target
 
 
 @command(
@@ -20,8 +19,9 @@ from jaxmpc.files import check_target
 )
 def controller(options: Options) -> int:
     """Write a tuned controller as a co-simulation FMU, which needs a Python with jaxmpc where it runs."""
-    check_target("--out", options.out)
-    from identify.controller_fmu import build_controller_fmu
+    from identify.controller_fmu import build_controller_fmu, check_fmu_target
+
+    check_fmu_target("--out", options.out)
     from identify.plants import model_of
     from identify.step_test import settling_notes
     from jaxmpc.controller.controller import Controller
@@ -39,6 +39,9 @@ def controller(options: Options) -> int:
     model = model_of(process)
     for note in settling_notes(model):
         print(f"jaxmpc: {note}", file=sys.stderr)
-    made = Controller(structure, tuning, model)
-    print(build_controller_fmu(made, options.out, process.model.working_point))
+    start = dict(process.model.working_point)
+    for name, actuator in zip(process.mv_names, process.actuators(), strict=True):
+        if name in start:  # a step test may begin where the actuator cannot stand
+            start[name] = float(actuator.move(float("inf"), start[name]))
+    print(build_controller_fmu(Controller(structure, tuning, model), options.out, start))
     return EXIT_OPTIMAL
