@@ -34,6 +34,7 @@ from pythonfmu import (
 
 from jaxmpc import load_controller
 from jaxmpc import status as codes
+from jaxmpc.controller.measurement import IMPLAUSIBLE
 from jaxmpc.errors import InputError
 
 CONTROLLER, START = "controller.json", "start.json"  # files in the FMU
@@ -93,9 +94,8 @@ def leave_soundly(folder: Path) -> None:
     if sys.platform != "linux" or not sys.orig_argv:
         return
     for library in (folder.parent / "binaries" / "linux64").glob("*.so"):
-        with contextlib.suppress(
-            OSError, AttributeError
-        ):  # not loaded, as in a test; or without this function
+        # not loaded, where this file is used without FMI; or a version without this function
+        with contextlib.suppress(OSError, AttributeError):
             atexit.register(ctypes.CDLL(str(library), os.RTLD_NOLOAD).finalizePythonInterpreter)
 
 
@@ -103,7 +103,7 @@ class JaxmpcController(Fmi2Slave):
     """A controller that a master of a co-simulation steps.
 
     A measurement, position or measured disturbance that is not a number was not received; a setpoint that is not a number
-    stays as it was. The first sample is taken for a steady state: a CV that was not received then is at its setpoint.
+    stays as it was. The first sample is taken for a steady state: a CV without a sound measurement then is at its setpoint.
     """
 
     def __init__(self, **given: Any):
@@ -111,7 +111,8 @@ class JaxmpcController(Fmi2Slave):
         folder = Path(self.resources or "")
         content = (folder / CONTROLLER).read_bytes()
         self.guid = uuid.uuid5(uuid.NAMESPACE_OID, content.hex())  # the same controller has the same
-        self._controller: Any = load_controller(folder / CONTROLLER)[0]
+        with self._aloud():
+            self._controller: Any = load_controller(folder / CONTROLLER)[0]
         self._start: dict[str, float] = json.loads((folder / START).read_text())
         structure, model = self._controller.structure, self._controller.model
         self._structure, self._dvs = structure, model.dv_names
@@ -133,27 +134,15 @@ class JaxmpcController(Fmi2Slave):
         held, moves, fixed = Fmi2Variability.continuous, Fmi2Variability.discrete, Fmi2Variability.fixed
         units = dict(zip(structure.cv_names, structure.cv_units, strict=False))
         for name in structure.cv_names:
-            unit = units.get(name, "")
-            number(name, unit, math.nan, INPUT, held, "measurement; not a number where none was received")
-            setpoint = start.get(name, math.nan)
-            number(
-                f"{name}.setpoint",
-                unit,
-                setpoint,
-                INPUT,
-                held,
-                "not a number: as before, or as first measured",
-            )
+            unit, setpoint = units.get(name, ""), start.get(name, math.nan)
+            text = "measurement; not a number where none was received"
+            number(name, unit, math.nan, INPUT, held, text)
+            text = "not a number: as before, or as first measured"
+            number(f"{name}.setpoint", unit, setpoint, INPUT, held, text)
         units = dict(zip(model.dv_names, model.dv_units, strict=False))
         for name in model.dv_names:
-            number(
-                name,
-                units.get(name, ""),
-                math.nan,
-                INPUT,
-                held,
-                "measured disturbance; not a number: as before",
-            )
+            text = "measured disturbance; not a number: as before"
+            number(name, units.get(name, ""), math.nan, INPUT, held, text)
         units = dict(zip(structure.mv_names, structure.mv_units, strict=False))
         for name in structure.mv_names:
             unit = units.get(name, "")
@@ -210,13 +199,10 @@ class JaxmpcController(Fmi2Slave):
     def exit_initialization_mode(self) -> None:
         """Compile, so that no sample waits for it."""
         rest = np.nan_to_num(self._read(f"{name}.setpoint" for name in self._structure.cv_names))
+        stand = self._read(f"{name}.start" for name in self._structure.mv_names)
         with self._aloud():
-            state = self._controller.init(
-                rest, self._read(f"{name}.start" for name in self._structure.mv_names)
-            )
-            self._controller.step(state, rest, rest)
-        for name in self._structure.mv_names:
-            self._values[name] = self._values[f"{name}.start"]
+            self._controller.step(self._controller.init(rest, stand), rest, rest)
+        self._values.update(zip(self._structure.mv_names, stand.tolist(), strict=True))
 
     def do_step(self, current_time: float, step_size: float) -> bool:
         """Step the controller at the sampling instants from now to before the end of the step, with the inputs of now.
@@ -260,7 +246,9 @@ class JaxmpcController(Fmi2Slave):
 
     def _started(self, cv: np.ndarray, position: np.ndarray, dv: np.ndarray) -> bool:
         """Whether enough is known to start, which is then done; until then the MVs stay at their start."""
-        sound = np.isfinite(cv)
+        tuning = self._controller.tuning
+        sound = (abs(cv) < IMPLAUSIBLE) & (cv >= tuning.measurement_low) & (cv <= tuning.measurement_high)
+        sound = np.asarray(sound)
         self._setpoint = np.where(np.isfinite(self._setpoint), self._setpoint, np.where(sound, cv, np.nan))
         if not np.isfinite(self._setpoint).all():
             return False

@@ -196,6 +196,13 @@ def test_a_measurement_that_is_not_received_stops_nothing_even_at_the_start(slav
     assert values["heater"] == 1.0  # the setpoint is as before
 
 
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e300])
+def test_a_cv_without_a_sound_measurement_at_the_start_counts_as_at_its_setpoint(slave, bad):
+    assert stepped(slave, 0.0, 1.0, temperature=bad, temperature__setpoint=22.0)["heater"] == 0.0
+    assert slave._state.base[0] == 22.0
+    assert stepped(slave, 1.0, 1.0, temperature=15.0)["heater"] == 1.0
+
+
 def test_measured_disturbances_count_from_the_first_sample_on(tmp_path):
     structure = HEATER.structure()
     model = model_of(HEATER)
@@ -284,7 +291,7 @@ def test_bad_input_is_refused_by_name_and_writes_nothing(path, start, field, tmp
 def test_a_controller_with_targets_is_refused(tmp_path):
     other = TargetController.__new__(TargetController)
     with pytest.raises(InputError, match="without targets"):
-        build_controller_fmu(other, tmp_path / "controller.fmu")  # pyright: ignore[reportArgumentType]
+        build_controller_fmu(other, tmp_path / "controller.fmu")
 
 
 def test_without_pythonfmu_the_message_says_what_to_install(monkeypatch, tmp_path):
