@@ -443,7 +443,8 @@ def main() -> None:
     for line in channel.makefile("rb"):
         request = json.loads(line)
         reply = {"n": request["n"], **runner.answer(request)}
-        channel.sendall(json.dumps(reply).encode() + b"\n")
+        text = json.dumps(reply, default=bytes.decode)  # FMPy gives texts as the bytes that they are
+        channel.sendall(text.encode() + b"\n")
         if "end" in request:
             return
     watch.join()  # the parent has gone: the files go, too

@@ -23,6 +23,7 @@ APPS = "studies/notebooks/"  # what a user opens and edits: puts studies and fig
 DOORS = {
     "highspy": ("jaxmpc/integer/highs.py",),
     "fmpy": ("identify/fmu.py", "identify/fmu_worker.py", "identify/fmu_exchange.py"),
+    "pythonfmu": ("identify/controller_fmu.py", "identify/controller_slave.py"),
     "matplotlib": ("figures/",),
     "dask": ("studies/",),
     "distributed": ("studies/",),

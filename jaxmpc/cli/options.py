@@ -18,7 +18,7 @@ EXIT_OPTIMAL, EXIT_OTHER, EXIT_BAD_INPUT, EXIT_INFEASIBLE, EXIT_LIMIT = 0, 1, 2,
 EXITS = "Exit status: 0 done, 2 bad input, 130 stopped by Ctrl-C, 1 anything else."
 PLANTS = ("fmu", "jax")
 FAMILIES = {
-    "fmu": "Build the well as an FMU, and look into any FMU.",
+    "fmu": "Build the well or a controller as an FMU, and look into any FMU.",
     "model": "Step-response models from files of other tools, and for them.",
     "process": "Process files: what studies need to know of a process.",
     "study": "Run studies, look at them, and export their results.",

@@ -84,6 +84,5 @@ class Identification:
     @property
     def worst(self) -> Verdict:
         """The worst verdict of a pair; pairs without a response count as good."""
-        order: tuple[Verdict, ...] = ("good", "look", "bad")
-        found = {row.verdict for row in self.verdicts} - {"none"}
-        return max(found, key=order.index, default="good")
+        found = {row.verdict for row in self.verdicts}
+        return "bad" if "bad" in found else "look" if "look" in found else "good"

@@ -146,8 +146,8 @@ def new_process(
     ]
     lines += _tuning(model, cv_spans, list(moves.values()), zones, horizon, control)
     shifts = [
-        _shift(*ranges[mv], point.get(mv, 0.0), span, steps.get(mv), mv in switches)
-        for mv, span in zip(model.mv_names, spans, strict=True)
+        _shift(low, high, point.get(mv, 0.0), span, steps.get(mv), mv in switches)
+        for (mv, (low, high)), span in zip(ranges.items(), spans.tolist(), strict=True)
     ]
     lines += _references(model, np.array(shifts), point, horizon)
     return "\n".join(lines), guesses
