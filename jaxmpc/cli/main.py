@@ -9,13 +9,12 @@ show themselves.
 
 from __future__ import annotations
 
-import contextlib
 import io
 import os
 import sys
 
 from jaxmpc.cli import bench, explore, figures, fmu_controller, identify, model, plan, process, study
-from jaxmpc.cli.options import EXIT_BAD_INPUT, EXIT_OTHER, Command, complain, parser
+from jaxmpc.cli.options import EXIT_BAD_INPUT, EXIT_OTHER, EXIT_UNREAD, Command, complain, parser
 from jaxmpc.errors import InputError, MissingToolError, PlantError
 from jaxmpc.programs import interrupts
 
@@ -31,7 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     Returns:
         The exit status: 0 done (for `plan`: optimal), 2 bad input with nothing written, 3 infeasible, 4 limit
-        reached with a feasible plan, 130 stopped by Ctrl-C, 1 anything else.
+        reached with a feasible plan, 130 stopped by Ctrl-C, 141 the reader of standard output has left, 1 anything else.
     """
     _provide_standard_streams()
     try:
@@ -54,14 +53,17 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _fail(error: OSError) -> int:
-    """What the system refused, in one line."""
+    """What the system refused, in one line; a reader that has read enough, as `head` does, is no fault."""
     name = error.filename
     if name is None:
-        with contextlib.suppress(OSError, ValueError):
+        try:
             sys.stdout.flush()
             return complain(error.strerror or error, EXIT_OTHER)
+        except (OSError, ValueError) as unwritten:
+            sys.stdout = open(os.devnull, "w")  # noqa: SIM115  (the interpreter would try the rest again and complain)
+            if isinstance(unwritten, BrokenPipeError):
+                return EXIT_UNREAD
         name = "standard output"
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115  (the interpreter would try the rest again and complain)
     return complain(f"{os.fsdecode(name)}: {error.strerror or error}", EXIT_OTHER)
 
 

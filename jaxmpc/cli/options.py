@@ -15,6 +15,7 @@ from jaxmpc.errors import InputError
 from jaxmpc.programs import interrupts
 
 EXIT_OPTIMAL, EXIT_OTHER, EXIT_BAD_INPUT, EXIT_INFEASIBLE, EXIT_LIMIT = 0, 1, 2, 3, 4
+EXIT_UNREAD = 141  # what shells report for a program that writes to a reader that has left
 EXITS = "Exit status: 0 done, 2 bad input, 130 stopped by Ctrl-C, 1 anything else."
 PLANTS = ("fmu", "jax")
 FAMILIES = {
