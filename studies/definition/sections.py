@@ -8,7 +8,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from jaxmpc.check import located, require
-from jaxmpc.controller.measurement import FAULTS
+from jaxmpc.controller.measurement import FAULTS, SensorFault
 from jaxmpc.loop.events import Event
 from jaxmpc.loop.trajectory import AXES
 from jaxmpc.process.file import DEFAULT_PROCESS
@@ -167,6 +167,10 @@ class FaultSection(Section, frozen=True):
     time: float
     duration: float | UnsetType = UNSET
     size: float = 0.0
+
+    def fault(self) -> SensorFault:
+        """As loops take it."""
+        return SensorFault(self.cv, self.kind, self.time, self.duration or None, self.size)
 
 
 class ReferenceDefinition(Section, frozen=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,13 +11,15 @@ import numpy as np
 
 from figures import style
 from figures.explore import COLOURS, Shown
+from jaxmpc.check import require
+from jaxmpc.errors import InputError
+from jaxmpc.files import toml_value
 from jaxmpc.problem.tuning import FIELDS as TUNING
 from studies.notebooks.export import cell_text
-from studies.notebooks.loop import SHORT, Explorer, ExploreRun, nested, tuning_of
+from studies.notebooks.loop import LISTS, SHORT, Explorer, ExploreRun, nested, tuning_of
 
 RATIOS = 2.0 ** np.arange(-5, 6)  # to the preset's own value, so that one slider serves values of any size
 NOW = "now"  # name of the run that the controls make
-EVENTS = ("disturbance.", "sensor_fault.")  # keys that an axis varies, of what the base lists
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +114,7 @@ def further_fields(explored: Explorer) -> list[dict[str, str]]:
     for key, _, start in chosen_fields(
         explored,
         explored.process.default_preset,
-        [k for k in explored.fields if k not in own and not k.startswith(EVENTS)],
+        [k for k in explored.fields if k not in own and k.partition(".")[0] not in LISTS],
     ):
         field = explored.fields[key]
         unit = "" if field.unit == "1" else style.unit(field.unit)
@@ -137,6 +140,48 @@ def chosen_fields(explored: Explorer, preset: str, keys: Sequence[str]) -> list[
     return out
 
 
+def example_lists(explored: Explorer) -> str:
+    """What can happen during a run of this process, as a text for `listed` in which nothing counts yet."""
+    process, dt = explored.process, explored.process.dt
+    cv, mv = process.cvs[0], process.mv_names[0]
+    deadzone = {"deadzone": {cv.name: float(f"{cv.span / 10:.3g}")}}
+    rows: list[tuple[str, dict[str, Any]]] = [
+        ("sensor_fault", {"cv": cv.name, "kind": "missing", "time": 60 * dt, "duration": 10 * dt}),
+        ("sensor_fault", {"cv": cv.name, "kind": "spike", "time": 90 * dt, "size": cv.span}),
+        ("event", {"time": 60 * dt, "mv_off": [mv]}),
+        ("event", {"time": 120 * dt, "mv_on": [mv], "tuning": deadzone}),
+    ]
+    if process.disturbances:
+        first = process.disturbances[0]
+        rows += [
+            ("disturbance", {"time": time * dt, "offset": offset, "name": first.name})
+            for time, offset in ((40, first.span), (100, 0.0))
+        ]
+    tables = (
+        [f"[[base.{table}]]", *(f"{k} = {toml_value(v)}" for k, v in row.items()), ""] for table, row in rows
+    )
+    return "\n".join(f"# {line}".rstrip() if line else "" for lines in tables for line in lines).rstrip()
+
+
+def listed(text: str) -> dict[str, Any]:
+    """What a text in the words of a study file lists: disturbances, events and faults of sensors.
+
+    Raises:
+        InputError: for what is no TOML, and for other tables.
+    """
+    expected = f"lists as in a study file, {', '.join(f'[[base.{name}]]' for name in LISTS)}"
+    try:
+        body = tomllib.loads(text)
+    except ValueError as error:
+        raise InputError("events", text, f"{expected} ({error})") from None
+    base = body.get("base", {})
+    others = sorted({*body} - {"base"}) if isinstance(base, dict) else ["base"]
+    require(not others, "events", others, expected)
+    others = sorted({*base} - {*LISTS})
+    require(not others, "events", others, expected, "Everything else of a base has a control of its own")
+    return base
+
+
 def base_of(
     explored: Explorer,
     chosen: Mapping[str, Any],
@@ -144,6 +189,7 @@ def base_of(
     tuning: Mapping[str, float],
     scenario: Mapping[str, float],
     further: Mapping[str, str],
+    events: str = "",
 ) -> dict[str, Any]:
     """The base table that the controls make.
 
@@ -153,6 +199,8 @@ def base_of(
         tuning: values of `tuning_sliders`.
         scenario: values of `scenario_sliders`.
         further: texts of `further_fields` by key; an empty one sets nothing.
+        events: text that `listed` reads. Steps of its disturbances come before those of the sliders, which must be later if
+            they are of the same disturbance.
 
     Raises:
         InputError: naming the key of a text that it does not accept.
@@ -173,7 +221,11 @@ def base_of(
         for name in process.disturbance_names
         if scenario[f"disturbance.{name}"]
     ]
-    return base | ({"disturbance": steps} if steps else {})
+    lists = listed(events)
+    if steps:
+        before = lists.get("disturbance", [])
+        lists["disturbance"] = [*before, *steps] if isinstance(before, list) else before
+    return base | lists
 
 
 def first_base(explored: Explorer) -> dict[str, Any]:

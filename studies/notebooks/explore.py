@@ -204,6 +204,16 @@ def _(choices, controls, explored, fields, kept, mo):
 
 
 @app.cell
+def _(controls, explored, mo):
+    events = mo.ui.text_area(
+        value=controls.example_lists(explored), rows=12, max_length=20000, full_width=True, debounce=True
+    )
+    _words = "Written as in a study file; what stands behind a `#` does not count. It holds when you leave the field."
+    events_panel = mo.vstack([mo.md(f"<small>{_words}</small>"), events], gap=0.4)
+    return events, events_panel
+
+
+@app.cell
 def _(choices, mo, model_panel, page, setpoint_panel, tuning_panel, choices_panel):
     _step = [] if choices.value["run"] else [setpoint_panel]
     _shown = [choices_panel, tuning_panel, *_step, model_panel] if page.value == "Run a loop" else []
@@ -219,6 +229,7 @@ def _(
     choices,
     compilation_shown,
     controls,
+    events,
     explore,
     explored,
     further,
@@ -231,7 +242,13 @@ def _(
     run, refused = None, None
     try:
         _base = controls.base_of(
-            explored, choices.value, soft.value, tuning.value, scenario.value, further.value
+            explored,
+            choices.value,
+            soft.value,
+            tuning.value,
+            scenario.value,
+            further.value,
+            events.value,
         )
         with compilation_shown(), progress_shown() as _report:
             run = explore.run(explored, _base, _report)
@@ -325,8 +342,12 @@ def _(controls, draw, export, get_pins, mo, page, run):
 
 
 @app.cell
-def _(further_panel, mo, page):
-    mo.accordion({"All settings": further_panel}) if page.value == "Run a loop" else None
+def _(events_panel, further_panel, mo, page):
+    _panels = {
+        "All settings": further_panel,
+        "Sensor faults, disturbances and events over time": events_panel,
+    }
+    mo.accordion(_panels, multiple=True) if page.value == "Run a loop" else None
     return
 
 

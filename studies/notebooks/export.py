@@ -31,7 +31,9 @@ def as_toml(done: ExploreRun, name: str = "explored") -> str:
 
 
 def as_python(done: ExploreRun) -> str:
-    """Structure and tuning of a run as Python that makes the same objects, every field written out."""
+    """Structure and tuning of a run, its events, faults and disturbances, as Python that makes the same objects, every
+    field written out.
+    """
     structure, tuning = done.scenario.structure, done.scenario.tuning
     given = {field.name: getattr(structure, field.name) for field in dataclasses.fields(Structure)}
     values = {}
@@ -42,7 +44,35 @@ def as_python(done: ExploreRun) -> str:
     lines = ["from math import inf", "", "from jaxmpc import Structure, make_tuning", ""]
     lines += ["structure = Structure(", *(f"    {name}={value!r}," for name, value in given.items()), ")"]
     lines += ["tuning = make_tuning(", "    structure,", *(f"    {k}={v!r}," for k, v in values.items()), ")"]
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_happening(done)]) + "\n"
+
+
+def _happening(done: ExploreRun) -> list[str]:
+    """What happens during a run, as Python of arguments of `jaxmpc.simulate`."""
+    scenario, samples, lines = done.scenario, done.trajectory.samples, []
+    if scenario.events:
+        lines += ["", "from jaxmpc import Event", "", "events = ["]
+        lines += [*(f"    {event!r}," for event in scenario.events), "]"]
+    faults = done.definition.base.get("sensor_fault", ())
+    if faults:
+        lines += [
+            "",
+            "from jaxmpc import SensorFault, fault_errors",
+            "",
+            f"faults = fault_errors(structure, {samples}, [",
+        ]
+        lines += [*(f"    {fault.fault()!r}," for fault in faults), "])"]
+    if scenario.disturbance is not None:
+        names, given = done.definition.process.disturbance_names, scenario.disturbance[:samples]
+        lines += [
+            "",
+            "import numpy as np",
+            "",
+            f"disturbance = np.zeros({given.shape})  # {', '.join(names)}",
+        ]
+        changes = np.flatnonzero(np.diff(given, axis=0, prepend=0.0).any(axis=1))
+        lines += [f"disturbance[{k}:] = {given[k].tolist()}" for k in changes]
+    return lines
 
 
 def differences(runs: Sequence[ExploreRun]) -> list[list[str]]:
@@ -71,8 +101,12 @@ def value_text(value: Any) -> str:
     if isinstance(value, Section):
         told = {name: getattr(value, name) for name in value.__struct_fields__}
         return ", ".join(
-            f"{name} {value_text(one)}" for name, one in told.items() if isinstance(one, (str, float, tuple))
+            f"{name} {value_text(one)}"
+            for name, one in told.items()
+            if isinstance(one, (str, float, tuple, dict)) and one not in ("", (), {})
         )
+    if isinstance(value, dict):
+        return " ".join(f"{name} {value_text(one)}" for name, one in value.items())
     if isinstance(value, tuple):
         inner = [value_text(one) for one in value]
         return (

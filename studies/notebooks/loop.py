@@ -39,6 +39,7 @@ Progress = Callable[[int, int], None]
 Base = Mapping[str, Any]  # the table [base] of a study
 
 STEP, SHORT = 30, 180  # samples: when the setpoints of a short run change, and how long it is
+LISTS = ("disturbance", "event", "sensor_fault")  # of a base, what happens during a run
 MOST_MOVES = 64  # of stepped MVs that are left to one another without blocks; a step with more takes seconds
 
 
@@ -263,7 +264,7 @@ def in_force(done: ExploreRun) -> dict[str, Any]:
             out[key] = getattr(structure, key)
         else:
             out[key] = field.default
-    for key in ("disturbance", "sensor_fault"):
+    for key in LISTS:
         out[key] = base.get(key, ())
     return out
 

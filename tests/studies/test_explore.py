@@ -38,6 +38,7 @@ from studies.notebooks.loop import RUN, SHORT, explorer, main, nested, run, show
 from studies.plans import plan_at
 from studies.rerun import close_loop
 from tests import studies_synthetic
+from tests.fmu_plants import make_plant, real
 from tests.sweep_synthetic import DEADZONE, OIL_DEADZONE, WEIGHT, grid, numbers, runs, write
 
 SHAPE = {"prediction_horizon": 40, "blocks": [1, 1, 2, 4, 8]}  # small, to compile quickly
@@ -167,6 +168,97 @@ def test_each_disturbance_starts_at_its_time(explored):
     assert done.trajectory.cv[61, 0] - done.trajectory.cv[60, 0] > 0.8  # added to the CV
 
 
+HAPPENING = """
+[[base.sensor_fault]]
+cv = "level"
+kind = "spike"
+time = 200
+size = 50
+[[base.event]]
+time = 300
+mv_off = ["feed"]
+tuning = { deadzone = { level = 0.25 } }
+[[base.disturbance]]
+time = 100
+offset = 1.5
+name = "ambient"
+"""
+
+
+def with_events(explored, text, **moved):
+    """The base of untouched controls with a text of events, and sliders moved."""
+    chosen, soft, tuning, scenario = start(explored)
+    base = controls.base_of(explored, chosen, soft, tuning, scenario | moved, {}, text)
+    return base | SHAPE | {"controller": "continuous"}
+
+
+@pytest.fixture(scope="module")
+def eventful(explored):
+    return run(explored, with_events(explored, HAPPENING, **{"disturbance.ambient": 2.0}))
+
+
+def test_what_is_listed_happens_beside_what_sliders_say(eventful, explored, continuous):
+    scenario, t = eventful.scenario, eventful.trajectory
+    assert scenario.disturbance[[19, 20, 89, 90], 0].tolist() == [0.0, 1.5, 1.5, 2.0]  # the slider's is later
+    assert scenario.faults[40].tolist() == [50.0, 0.0]
+    assert np.count_nonzero(scenario.faults) == 1  # one sample, as no duration is given
+    assert np.ptp(t.mv[60:, 0]) == 0.0  # held
+    assert np.ptp(t.mv[30:60, 0]) > 0.0
+    assert [row[1:] for row in export.differences([continuous, eventful])] == [
+        [
+            "disturbance",
+            "–",
+            "time 100, offset 1.5, name ambient; time 450, offset 2, name ambient",
+            "",
+        ],
+        ["event", "–", "time 300, tuning deadzone level 0.25, mv_off feed", ""],
+        ["sensor_fault", "–", "cv level, kind spike, time 200, size 50", ""],
+    ]
+
+
+def test_what_is_listed_leaves_the_app_as_a_study_and_as_python(eventful):
+    study = expand(StudyDefinition.from_dict(tomllib.loads(export.as_toml(eventful))))
+    assert study.scenario_hash(0) == expand(eventful.definition).scenario_hash(0)
+    made = {}
+    exec(export.as_python(eventful), made)
+    assert tuple(made["events"]) == eventful.scenario.events
+    np.testing.assert_array_equal(made["faults"], eventful.scenario.faults)
+    np.testing.assert_array_equal(made["disturbance"], eventful.scenario.disturbance)
+
+
+@pytest.mark.parametrize("name", ["explored", "well"])
+def test_examples_of_events_do_nothing_until_they_are_uncommented(name, request):
+    explored = request.getfixturevalue(name)
+    text = controls.example_lists(explored)
+    assert controls.listed(text) == {}
+    body = explored.definition.body | {"base": controls.listed(text.replace("# ", ""))}
+    scenario = expand(StudyDefinition.from_dict(body)).scenario(0)
+    assert len(scenario.events) == 2
+    assert np.isnan(scenario.faults).any()
+    assert scenario.disturbance.any()
+
+
+@pytest.mark.parametrize(
+    ("text", "field"),
+    [
+        ("[[base.event]", "events"),
+        ("[[event]]", "events"),
+        ("base = 1", "events"),
+        ("[base]\nseed = 1", "events"),
+        ("[base]\ndisturbance = 1", "base.disturbance"),
+        ('[[base.sensor_fault]]\ncv = "flow"\nkind = "missing"\ntime = 5', "base.sensor_fault[0].cv"),
+        ('[[base.sensor_fault]]\ncv = "level"\nkind = "frozen"\ntime = 1e9', "base.sensor_fault[0].time"),
+        ("[[base.event]]\ntime = 2000-01-01", "base.event[0].time"),
+        ('[[base.event]]\ntime = 5\nmv_off = ["pump"]', "base.event[0].mv_off"),
+        ('[[base.disturbance]]\ntime = 600\noffset = 1\nname = "ambient"', "base.disturbance[1].time"),
+    ],
+)
+def test_a_list_that_cannot_be_is_refused_by_its_place_before_anything_runs(text, field, explored):
+    with pytest.raises(InputError) as refused:
+        run(explored, with_events(explored, text, **{"disturbance.ambient": 1.0}))
+    assert refused.value.field == field
+
+
 @pytest.mark.parametrize(
     ("changes", "field"),
     [
@@ -262,6 +354,79 @@ def test_other_numbers_compile_nothing_again(kind, explored):
     assert compiled == []
     jax.jit(lambda x: x + len(compiled))(1.0)  # the ear is not deaf
     assert compiled
+
+
+FROM_FILE = """
+name = "tank"
+dt = 1
+cv = [{ name = "level", unit = "m", span = 1 }]
+mv = [{ name = "valve", unit = "%", span = 5, low = 0, high = 10, move = 1, actuator = { kind = "stepped", step = 1 } }]
+disturbance = [{ name = "rain", unit = "m" }]
+model = { working_point = { valve = 0 }, steps = { valve = 1 }, samples = 30 }
+structure = { prediction_horizon = 20, control_horizon = 8, blocks = [1, 1, 2, 4] }
+presets.default = { cv_weight = 1, move_weight = 0.01, deadzone = 0.1 }
+references.quick = { duration = 60, windows = [[0, 0], [30, 1.5]] }
+"""
+TANK = """
+from typing import NamedTuple
+import numpy as np
+
+class Outputs(NamedTuple):
+    cv: np.ndarray
+    mv: np.ndarray
+
+class Tank:
+    dt, disturbance_names = 1.0, ("rain",)
+    def __init__(self, actuators):
+        self.actuators = actuators
+    def init(self):
+        self.cv, self.mv = np.zeros(1), np.zeros(1)
+        return Outputs(self.cv, self.mv)
+    def step(self, mv, disturbance):
+        self.mv = np.array([a.move(now, to) for a, now, to in zip(self.actuators, self.mv, mv)])
+        self.cv = self.cv + (1 - np.exp(-1 / 4.0)) * (0.5 * self.mv + disturbance - self.cv)
+        return Outputs(self.cv, self.mv)
+"""
+
+
+@pytest.fixture(scope="module")
+def tank(tmp_path_factory):
+    """A run on a tank, a lag of 4 s and a gain of 0.5, that a Python class computes; folder and run."""
+    folder = tmp_path_factory.mktemp("tank")
+    (folder / "own_tank.py").write_text(TANK)
+    plant = 'plants.tank = { kind = "python", source = "own_tank:Tank" }'
+    (folder / "tank.toml").write_text(FROM_FILE + plant)
+    one = explorer(folder / "tank.toml")
+    return folder, run(one, controls.first_base(one) | nested({"controller": "continuous"}))
+
+
+def test_a_run_on_a_class_in_python_has_its_plan_and_is_a_study(tank):
+    _, done = tank
+    t = done.trajectory
+    assert abs(t.cv[-1, 0] - 1.5) < 0.25  # half of what a step of the valve does
+    np.testing.assert_allclose(t.mv[:, 0], np.round(t.mv[:, 0]))
+    np.testing.assert_allclose(plan_at(done.data, RUN, 30.0).move[0], t.move[30], atol=1e-6)
+    body = tomllib.loads(export.as_toml(done))
+    assert expand(StudyDefinition.from_dict(body)).scenario_hash(0) == expand(done.definition).scenario_hash(
+        0
+    )
+
+
+def test_a_run_on_an_fmu_is_that_on_a_class_with_its_equations(tank):
+    folder, done = tank
+    variables = [real("valve", 0, start=0), real("rain", 1, start=0), real("level", 10, "output")]
+    rates, outputs = "d[0] = (0.5 * u[0] + u[1] - x[0]) / 4", "y[0] = x[0]"
+    fmu = make_plant(folder, variables, rates=rates, outputs=outputs)
+    (folder / "fmu.toml").write_text(f'{FROM_FILE}plants.tank = {{ kind = "fmu", source = "{fmu.name}" }}')
+    one = explorer(folder / "fmu.toml")
+    base = controls.first_base(one) | nested({"controller": "continuous"})
+    same = run(one, base)
+    # its steps of 0.25 s are off by 1e-7, which a demand between two positions would show as a whole step
+    np.testing.assert_allclose(same.trajectory.cv, done.trajectory.cv, atol=1e-5)
+    assert {k: v for k, v in same.kpis.items() if k.startswith(("travel", "reversals"))} == {
+        k: v for k, v in done.kpis.items() if k.startswith(("travel", "reversals"))
+    }
+    run(one, base)  # each run has an FMU of its own
 
 
 def test_progress_ends_with_all_samples(explored):
