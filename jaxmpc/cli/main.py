@@ -9,6 +9,7 @@ show themselves.
 
 from __future__ import annotations
 
+import gc
 import io
 import os
 import sys
@@ -18,6 +19,9 @@ from jaxmpc.cli.options import EXIT_BAD_INPUT, EXIT_OTHER, EXIT_UNREAD, Command,
 from jaxmpc.errors import InputError, MissingToolError, PlantError
 from jaxmpc.programs import interrupts
 
+# Objects between two looks for cycles of garbage: imports and programs that are traced make many objects and little
+# garbage, and with Python's own 700 a fifth of the time until the first result went into looking.
+SELDOM = 50_000
 PLATFORM_VARIABLES = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")
 
 
@@ -32,6 +36,7 @@ def main(arguments: list[str] | None = None) -> int:
         The exit status: 0 done (for `plan`: optimal), 2 bad input with nothing written, 3 infeasible, 4 limit
         reached with a feasible plan, 130 stopped by Ctrl-C, 141 the reader of standard output has left, 1 anything else.
     """
+    gc.set_threshold(SELDOM)
     _provide_standard_streams()
     try:
         try:

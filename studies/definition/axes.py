@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 from msgspec import UNSET
-from scipy.special import ndtri
-from scipy.stats import qmc
 
 from jaxmpc.check import require
 from jaxmpc.errors import InputError
@@ -130,6 +128,8 @@ def unit_points(method: str, dimensions: int, count: int, seed: int) -> np.ndarr
 
     The first draws of a Sobol sequence do not depend on how many are drawn; those of a Latin hypercube do.
     """
+    from scipy.stats import qmc  # half a second that only draws need
+
     seeded: dict[str, Any] = {"seed": np.random.default_rng(seed)}
     if method == "sobol":
         powers = max(0, math.ceil(math.log2(count)))
@@ -142,6 +142,8 @@ def draw(distribution: Distribution, points: np.ndarray) -> np.ndarray:
     d: Any = distribution
     with np.errstate(over="ignore", invalid="ignore"):  # the values are checked afterwards
         if distribution.kind == "normal":
+            from scipy.special import ndtri
+
             return d.mean + d.deviation * ndtri(np.clip(points, EDGE, 1 - EDGE))
         if distribution.kind == "log-uniform":
             return d.from_ * np.float64(d.to / d.from_) ** points

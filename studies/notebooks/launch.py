@@ -108,7 +108,7 @@ class First:
             with told(self.said.append):
                 self.loaded.set()  # from here on a page may listen, and is the last to
                 explored = loop.explorer(process or loop.DEFAULT_PROCESS)
-                loop.run(explored, controls.first_base(explored))
+                explored.first.append(loop.run(explored, controls.first_base(explored)))
             self._found.set_result(explored)
         except BaseException as error:  # whoever waits for it gets it
             self.loaded.set()

@@ -50,10 +50,12 @@ class Explorer:
     Attributes:
         definition: a study of the process, without settings.
         models: those identified so far, by working point.
+        first: the run that is there before anybody asks for it, see `studies.notebooks.launch.First`.
     """
 
     definition: StudyDefinition
     models: dict[Point, StepResponseModel] = dataclasses.field(default_factory=dict)
+    first: list[ExploreRun] = dataclasses.field(default_factory=list)
 
     @property
     def process(self) -> Process:
@@ -176,6 +178,8 @@ def run(explored: Explorer, base: Base | None = None, progress: Progress | None 
     """
     begin = time.perf_counter()
     process, fields = explored.process, explored.fields
+    if explored.first and explored.first[0].definition.body["base"] == base:
+        return explored.first[0]
     given = {"reference": explored.short_step(), **(base or {})}
     definition = dataclasses.replace(
         explored.definition,

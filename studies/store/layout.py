@@ -22,6 +22,11 @@ RESERVED = ("scenario", "slot", "scenario_hash", "commits", "manifest")  # names
 FLAG = "complete"  # the one variable that the store also knows
 
 
+def is_trajectory(dims: tuple[str, ...]) -> bool:
+    """Whether a variable with these axes after the slot is large: compressed, and read only when asked for."""
+    return "time" in dims
+
+
 @dataclass(frozen=True)
 class Column:
     """One scenario coordinate: what differs between the scenarios."""

@@ -14,14 +14,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import xarray as xr
-import zarr
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from jaxmpc.errors import InputError
 from studies.store.files import RESULTS, DamagedError, Survey, checked, chunk_file, open_manifest, survey
-from studies.store.layout import FLAG
-from studies.store.template import is_trajectory
+from studies.store.layout import FLAG, is_trajectory
 
 
 def open_results(path: str | Path) -> xr.Dataset:
@@ -66,6 +64,8 @@ def open_study(path: str | Path) -> xr.Dataset:
     Warns:
         UserWarning: naming damaged files of chunks; their scenarios read as empty.
     """
+    import zarr  # a tenth of a second; everything that knows of stores imports this module
+
     store, manifest = open_manifest(path)
     root = zarr.open_group(str(store), mode="r", zarr_format=3)
     rows, variables = manifest["rows"], manifest["variables"]

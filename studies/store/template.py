@@ -20,15 +20,10 @@ from zarr.storage import MemoryStore
 
 from jaxmpc.files import write_atomically
 from studies.store.files import COMMITS, FORMAT, MANIFEST, chunk_file, text_content
-from studies.store.layout import StoreLayout, Variable
+from studies.store.layout import StoreLayout, Variable, is_trajectory
 
 _TEXT = np.dtypes.StringDType()
 _KEYS: Any = {"name": "default", "separator": "."}
-
-
-def is_trajectory(dims: tuple[str, ...]) -> bool:
-    """Whether a variable with these axes after the slot is large: compressed, and read only when asked for."""
-    return "time" in dims
 
 
 def _variable_options(layout: StoreLayout, variable: Variable, slots: int) -> dict[str, Any]:
