@@ -61,6 +61,9 @@ def test_the_fractionator_has_the_published_transfer_functions_between_samples_t
             expected = lag(gain[i][j], dead[i][j], constant[i][j], t)
             np.testing.assert_allclose(found[i, j], expected, atol=1e-12)
     assert model.dv_names == ("intermediate_duty", "upper_duty")
+    found = np.asarray(gain)[:, :3]
+    relative = np.diag(found * np.linalg.inv(found).T)  # as published, which no misread gain would leave as they are
+    np.testing.assert_allclose([np.linalg.det(found), *relative], [20.85, 2.08, 0.94, 4.71], atol=0.01)
 
 
 def test_the_fractionator_study_has_the_published_gain_uncertainty():
