@@ -62,7 +62,7 @@ def test_the_fractionator_has_the_published_transfer_functions_between_samples_t
             np.testing.assert_allclose(found[i, j], expected, atol=1e-12)
     assert model.dv_names == ("intermediate_duty", "upper_duty")
     found = np.asarray(gain)[:, :3]
-    relative = np.diag(found * np.linalg.inv(found).T)  # as published, which no misread gain would leave as they are
+    relative = np.diag(found * np.linalg.inv(found).T)  # as published: no misread gain would leave them
     np.testing.assert_allclose([np.linalg.det(found), *relative], [20.85, 2.08, 0.94, 4.71], atol=0.01)
 
 
