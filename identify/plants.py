@@ -148,13 +148,21 @@ def load_model(process: Process, file: str = "") -> StepResponseModel:
     if not file and process.model.responses:
         return _sampled(process)
     file = file or process.model.file
-    model = StepResponseModel.load(Path(process.folder) / file)
+    return fitting(process, StepResponseModel.load(Path(process.folder) / file), f"{file}: ")
+
+
+def fitting(process: Process, model: StepResponseModel, place: str) -> StepResponseModel:
+    """A model as it is, if it has the CVs and MVs of a process in its order, and its sampling interval.
+
+    Raises:
+        InputError: naming what does not fit, after `place`.
+    """
     for key, names in (("cv", process.cv_names), ("mv", process.mv_names)):
         found = getattr(model, f"{key}_names")
         if found != names:
-            raise InputError(f"{file}: {key}", list(found), f"those of the process: {', '.join(names)}")
+            raise InputError(f"{place}{key}", list(found), f"those of the process: {', '.join(names)}")
     if abs(model.dt - process.dt) > 1e-9 * process.dt:
-        raise InputError(f"{file}: dt", model.dt, f"dt = {process.dt:g} s of the process")
+        raise InputError(f"{place}dt", model.dt, f"dt = {process.dt:g} s of the process")
     return model
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
-from identify.plants import closing, disturbance_of
+from identify.plants import closing, disturbance_of, fitting
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.schedule import ModelSchedule, ScheduledController
 from jaxmpc.errors import InputError
@@ -251,14 +251,7 @@ def comparison_layout(
     """The store of a comparison: setpoints, tuning, model and provenance."""
     first = definition.controllers[0].structure(process)
     reference = definition.reference.build(process)
-    if model.cv_names != first.cv_names or model.mv_names != first.mv_names:
-        raise InputError(
-            "model.cv, model.mv",
-            [*model.cv_names, *model.mv_names],
-            f"the names {[*first.cv_names, *first.mv_names]} of the controllers",
-        )
-    if abs(model.dt - first.dt) > 1e-9:
-        raise InputError("model.dt", model.dt, f"the sampling interval of the controllers, {first.dt} s")
+    fitting(process, model, "model.")
     structures = [controller.structure(process) for controller in definition.controllers]
     return results_layout(
         controllers={controller.name: controller.label for controller in definition.controllers},
