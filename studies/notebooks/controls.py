@@ -160,7 +160,7 @@ def example_lists(explored: Explorer) -> str:
     tables = (
         [f"[[base.{table}]]", *(f"{k} = {toml_value(v)}" for k, v in row.items()), ""] for table, row in rows
     )
-    return "\n".join(f"# {line}".rstrip() if line else "" for lines in tables for line in lines).rstrip()
+    return "\n".join(f"# {line}" if line else "" for lines in tables for line in lines)
 
 
 def listed(text: str) -> dict[str, Any]:

@@ -25,6 +25,8 @@ def _(mo):
     if "first" in meta:
         meta["first"].loaded.wait()
 
+    import altair  # noqa: F401  (while the first run is made, and not after it)
+
     from figures import choose, closed_loop
     from figures import explore as draw
     from jaxmpc import html
