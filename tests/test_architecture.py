@@ -179,6 +179,7 @@ def test_the_command_line_imports_nothing_heavy_before_a_command_asks_for_it():
         "argparse",
         "collections",
         "contextlib",
+        "gc",
         "io",
         "json",
         "os",
