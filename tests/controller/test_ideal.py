@@ -55,14 +55,12 @@ def solve(body):
 
 
 def steered_case(seed, **shape):
-    """A random case with an ideal value of every MV, of an influence like that of the CVs; one may have no weight."""
+    """A random case with ideal values; the first MV of some has none."""
     rng = np.random.default_rng(seed)
     body = problems.small_case(rng, **shape)
-    tuning, unit = body["tuning"], np.array(body["tuning"]["move_high"])
-    tuning["ideal"] = (body["mv_now"] + unit * rng.uniform(-4, 4, len(unit))).tolist()
-    tuning["ideal_weight"] = (10 ** rng.uniform(-1.5, 0.5, len(unit)) / unit**2).tolist()
+    problems.ideal_values(body, rng)
     if seed % 4 == 0:
-        tuning["ideal_weight"][0] = 0.0
+        body["tuning"]["ideal_weight"][0] = 0.0
     return body
 
 
