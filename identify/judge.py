@@ -193,9 +193,9 @@ def _limits(process: Process, model: StepResponseModel) -> list[Finding]:
         words = (
             f"slack_weight {price:.4g}{unit}; {needed:.3g} keeps them while setpoints are off by their spans"
         )
-        share = (price - fixed[i]) / by_span[i] if by_span[i] else np.inf
+        share = 1.0 if price >= needed else max(price - fixed[i], 0.0) / max(by_span[i], 1e-300)
         if share < GIVES_WAY:
-            words += f", this one up to {max(share, 0.0):.2g} of them: setpoints farther off come before these limits"
+            words += f", this one up to {share:.2g} of them: setpoints farther off come before these limits"
         out.append(Finding("look" if share < GIVES_WAY else "fine", subject, words))
     return out
 
