@@ -33,6 +33,7 @@ DOORS = {
     "scipy": (
         "jaxmpc/integer/tighten.py",
         "identify/judge.py",
+        "identify/logged/",
         "studies/bench/",
         "studies/definition/axes.py",
     ),

@@ -10,7 +10,7 @@ from typing import Any
 from jaxmpc.cli.options import EXIT_OPTIMAL, EXIT_OTHER, Options, command, option, switch
 from jaxmpc.files import check_folder, check_target
 
-SECTIONS = "relaxed, batch, exact, foreign, loop, growth, startup, sweep, gpu"
+SECTIONS = "relaxed, batch, exact, foreign, loop, growth, startup, sweep, identification, gpu"
 SWEEP = {"dest": "only", "action": "store_const", "const": "sweep"}
 DRAWN = "where to draw time per sample, rate over batch size and performance profiles (default: nowhere)"
 WRITTEN = "write instances as case files with their optima, and measure nothing: those of --only foreign (default) or exact"

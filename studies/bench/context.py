@@ -46,6 +46,7 @@ class Size:
     sweep_stored: int = 10_000  # scenarios of the store that is opened
     sweep_scanned: int = 1000  # chunks of the store that is resumed
     sweep_memory: tuple[int, int] = (8, 80)  # chunks of the two sweeps whose memory is compared
+    identified: int = 10  # logs of each kind that models are identified from
 
 
 FULL = Size()
@@ -68,6 +69,7 @@ QUICK = Size(
     sweep_stored=640,
     sweep_scanned=50,
     sweep_memory=(2, 6),
+    identified=2,
 )
 
 

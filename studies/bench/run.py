@@ -18,7 +18,7 @@ from studies.bench.folder import found, read, shipped, write
 from studies.bench.instances import MODES
 from studies.bench.peers import MIQP_PEERS, QP_PEERS, Peer
 from studies.bench.rows import Report, Row, table
-from studies.bench.sections import exact, foreign, growth, loops, relaxed, startup, sweeps
+from studies.bench.sections import exact, foreign, growth, identification, loops, relaxed, startup, sweeps
 from studies.store.fingerprint import versions
 
 Section = Callable[[Context], Iterator[Row]]
@@ -31,6 +31,7 @@ SECTIONS: dict[str, Section] = {
     "growth": growth.growth,
     "startup": startup.startup,
     "sweep": sweeps.sweeps,
+    "identification": identification.identification,
     "gpu": relaxed.devices,
 }
 

@@ -1,0 +1,216 @@
+"""The columns of a CSV or Parquet file as numbers: separators, decimal commas, units, texts that stand for no value.
+
+What is no number, no time and no known word for a missing value is refused with its column and row: guessing would put
+wrong numbers into a model.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from identify.logged.stamps import is_stamp, seconds
+from jaxmpc.errors import InputError, near
+
+WORDS = (
+    "nan na n/a null none bad - -- --- ? no_data nodata invalid questionable uncertain offline error shutdown"
+)
+SENTENCES = (
+    "no data",
+    "bad input",
+    "i/o timeout",
+    "not connect",
+    "scan off",
+    "pt created",
+    "out of serv",
+    "#n/a",
+)
+MISSING = frozenset(("", *WORDS.split(), *SENTENCES))
+UNIT = re.compile(r"^(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))$")  # NAME [UNIT] or NAME (UNIT)
+GROUPED = re.compile(r"^[+-]?\d{1,3}(\.\d{3})*(,\d+)?([eE][+-]?\d+)?$|^[+-]?\d*,?\d+([eE][+-]?\d+)?$")
+
+
+class Table(NamedTuple):
+    """Columns of a file.
+
+    Attributes:
+        stamps: [s], since 1970 where the file says; None without a column of times.
+        begin: the first stamp as it stands in the file.
+        columns: by name, NaN where there is no value.
+        units: by name, of those that have one.
+        notes: what was assumed.
+    """
+
+    stamps: Float[np.ndarray, " row"] | None
+    begin: str
+    columns: dict[str, Float[np.ndarray, " row"]]
+    units: dict[str, str]
+    notes: tuple[str, ...]
+
+
+def read_table(path: str | Path, names: Sequence[str], time: str | None) -> Table:
+    """Read the named columns and the times.
+
+    Args:
+        path: of a ``.csv`` (or ``.txt``, ``.tsv``) or ``.parquet`` file.
+        names: of the columns that are read, with or without a unit in brackets.
+        time: column of the times; the first one if it is none of the named.
+
+    Raises:
+        InputError: for a file that cannot be read, a missing column, or a text that is no number, with its column and row.
+    """
+    parquet = Path(path).suffix.lower() == ".parquet"
+    heads, rows, first = _parquet(path) if parquet else _csv(path)
+    places, units = _places(heads, names)
+    at = _time_column(heads, places, time)
+    decimal, unit_row, notes = False, False, []
+    if not parquet:
+        decimal = first[1]
+        unit_row = bool(rows[0]) and _is_unit_row([rows[places[name]][0] for name in names], decimal)
+        if unit_row:
+            units |= {name: str(rows[places[name]][0]).strip() for name in names}
+            rows = [column[1:] for column in rows]
+            notes.append("the row below the names was taken for units")
+        if decimal:
+            notes.append("numbers have a decimal comma")
+    line = (first[0] if not parquet else 1) + unit_row
+    columns = {name: _numbers(name, rows[places[name]], line, decimal) for name in names}
+    if not len(next(iter(columns.values()))):
+        raise InputError("data", str(path), "rows of values below the names")
+    stamps, begin = None, ""
+    if at is not None and len(rows[at]):
+        stamps, said = seconds(heads[at], rows[at], line, decimal)
+        begin, notes = str(rows[at][0]).strip(), [*notes, *said]
+    return Table(stamps, begin, columns, {k: v for k, v in units.items() if v}, tuple(notes))
+
+
+def _csv(path: str | Path) -> tuple[list[str], list[list[str]], tuple[int, bool]]:
+    """Names, columns of texts, and ``(line of the first row, whether commas are decimal)``."""
+    try:
+        raw = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError("data", str(path), f"a file that can be read ({error.strerror or error})") from None
+    text = _decoded(raw).replace("\0", "")
+    lines = [line for line in text.splitlines()[:50] if line.strip()]
+    if not lines:
+        raise InputError("data", str(path), "a row of names and rows of values; the file is empty")
+    separator = max(";\t,|", key=lambda mark: (lines[0].count(mark), mark == ";"))
+    table = [row for row in csv.reader(io.StringIO(text), delimiter=separator) if any(map(str.strip, row))]
+    heads = [name.strip().lstrip("\ufeff") for name in table[0]]
+    while heads and not heads[-1]:
+        heads.pop()
+    for k, row in enumerate(table[1:], start=2):
+        if len(row) < len(heads):
+            raise InputError(f"row {k}", separator.join(row), f"{len(heads)} values, one per name")
+    columns = [list(column) for column in zip(*(row[: len(heads)] for row in table[1:]), strict=True)]
+    columns = columns or [[] for _ in heads]
+    sample = [text.strip() for column in columns for text in column[:200]]
+    decimal = separator != "," and any("," in t and GROUPED.match(t) for t in sample)
+    return heads, columns, (2, decimal)
+
+
+def _decoded(raw: bytes) -> str:
+    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return raw.decode("utf-16", errors="replace")
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return raw.decode("cp1252", errors="replace")
+
+
+def _parquet(path: str | Path) -> tuple[list[str], list[Any], tuple[int, bool]]:
+    try:
+        from pyarrow import parquet
+    except ImportError:
+        expected = "a CSV file: reading Parquet needs pip install 'jaxmpc[parquet]'"
+        raise InputError("data", str(path), expected) from None
+    try:
+        table = parquet.read_table(path)
+    except Exception as error:
+        raise InputError("data", str(path), f"a readable Parquet file ({error})") from None
+    columns = []
+    for column in table.columns:
+        values = column.to_pandas() if hasattr(column, "to_pandas") else column.to_pylist()
+        columns.append(np.asarray(values))
+    return [str(name) for name in table.column_names], columns, (1, False)
+
+
+def _places(heads: Sequence[str], names: Sequence[str]) -> tuple[dict[str, int], dict[str, str]]:
+    """Where each named column stands, and its unit if its head has one."""
+    known: dict[str, list[tuple[int, str]]] = {}
+    for k, head in enumerate(heads):
+        known.setdefault(head, []).append((k, ""))
+        if found := UNIT.match(head):
+            known.setdefault(found[1], []).append((k, found[2] or found[3] or ""))
+            known[head][-1] = k, found[2] or found[3] or ""
+    for name in names:
+        if name not in known:
+            expected = f"a column of the file: {', '.join(heads)}"
+            raise InputError("column", name, expected, near(name, known))
+        if len(known[name]) > 1:
+            raise InputError("column", name, "a name that one column has, not several")
+    if len(set(names)) < len(names):
+        raise InputError("column", list(names), "distinct names: one column is one MV, CV or DV")
+    return {name: known[name][0][0] for name in names}, {name: known[name][0][1] for name in names}
+
+
+def _time_column(heads: Sequence[str], places: dict[str, int], time: str | None) -> int | None:
+    if time is not None:
+        found, _ = _places(heads, [time])
+        if found[time] in places.values():
+            raise InputError("--time", time, "a column that is no MV, CV or DV")
+        return found[time]
+    named = re.compile(r"(date|time|stamp|zeit|datum|uhrzeit|t)\b|.*(time|stamp)$", re.IGNORECASE)
+    free = [k for k in range(len(heads)) if k not in places.values()]
+    return next((k for k in free if k == 0 or named.match(heads[k])), None)
+
+
+def _is_unit_row(texts: Iterable[str], decimal: bool) -> bool:
+    """Whether none of them is a number or a known word, and one has a letter, a percent sign or a degree."""
+    texts = [str(text).strip() for text in texts]
+    plain = [t for t in texts if t.lower() not in MISSING or t == "-"]
+    return (
+        bool(plain) and all(_number(t, decimal) is None and not is_stamp(t) for t in plain) and plain != ["-"]
+    )
+
+
+def _number(text: str, decimal: bool) -> float | None:
+    if decimal and "," in text:
+        text = text.replace(".", "").replace(",", ".")
+    try:
+        return float(text.replace("_", "x"))
+    except ValueError:
+        return None
+
+
+def _numbers(name: str, texts: Sequence[Any], line: int, decimal: bool) -> Float[np.ndarray, " row"]:
+    """A column as floats; NaN for what stands for no value."""
+    if isinstance(texts, np.ndarray) and texts.dtype.kind in "biuf":
+        out = texts.astype(float)
+    else:
+        out = np.empty(len(texts))
+        try:
+            if decimal:
+                raise ValueError
+            out[:] = np.array(texts, dtype=float)
+        except (ValueError, TypeError):
+            for k, text in enumerate(texts):
+                out[k] = _value(name, text, line + k, decimal)
+    return np.where(np.abs(out) < 1e30, out, np.nan)
+
+
+def _value(name: str, text: Any, row: int, decimal: bool) -> float:
+    if text is None or str(text).strip().lower() in MISSING:
+        return np.nan
+    value = _number(str(text).strip(), decimal)
+    if value is None:
+        expected = 'a number, or one of "", NaN, null, Bad, No Data, ... where there is none'
+        raise InputError(f"column {name}, row {row}", text, expected)
+    return value
