@@ -1,7 +1,7 @@
 """A controller on logged data: at every sample what it would have advised, beside what was done.
 
-The log is the plant, which does not listen: what was done enters the predictions as past moves, and every advice begins where
-the actuators really stood (`Core.locate`). `studies.run.replay` reads logs and stores what `replay` gives.
+The log is the plant, which does not listen: what was done enters the predictions as past moves, and every advice begins
+where the actuators really stood (`Core.locate`). `studies.run.replay` reads logs and stores what `replay` gives.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def replay(
     """What the controller would have advised at every sample, given what was done before.
 
     The first row of a stretch says where the plant stood, taken for a steady state. At each later row k the controller gets
-    the CVs and disturbances of row k and the MVs of row k-1, where the actuators stand, and advises; row k then says what was
-    done. Without a time limit the same rows give the same decisions, bit for bit.
+    the CVs and disturbances of row k and the MVs of row k-1, where the actuators stand, and advises; row k then says what
+    was done. Without a time limit the same rows give the same decisions, bit for bit.
 
     Args:
         controller: without a time limit.

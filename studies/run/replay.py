@@ -62,8 +62,8 @@ def run_replay(
         say: receives one line per event.
 
     Returns:
-        The folder, with ``results.zarr`` (`studies.store.reading.open_results`) and one controller `ADVICE`: its ``position``
-        is what was done, its ``demand`` what was advised.
+        The folder, with ``results.zarr`` (`studies.store.reading.open_results`) and one controller `ADVICE`: its
+        ``position`` is what was done, its ``demand`` what was advised.
 
     Raises:
         InputError: for another preset or reference, and a log that cannot be read; before anything is computed.
