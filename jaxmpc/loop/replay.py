@@ -89,18 +89,17 @@ def replay(
         if not np.isfinite(values).all():
             raise InputError(f"log.{name}", "not a number", f"numbers for {', '.join(names)}")
     lanes, records, total = controller.lanes, [], len(done.decided)
-    dv = done.dv if controller.model.dv_names else None
-    at = lambda values, k: None if values is None else values[k][None]  # noqa: E731
+    measured = bool(controller.model.dv_names)
+    dv = lambda rows: rows[None] if measured else None  # noqa: E731
     with undisturbed():
         for own in done.stretches:
             first = own.start
-            started = np.where(np.isfinite(done.dv[first]), done.dv[first], 0.0)[None]
-            state = lanes.init(at(done.cv, first), at(done.mv, first), None if dv is None else started)
+            state = lanes.init(done.cv[first][None], done.mv[first][None], dv(np.nan_to_num(done.dv[first])))
             for k in range(first + 1, own.stop):
-                told = at(done.cv, k), at(done.setpoint, k), at(done.mv, k - 1)
+                told = done.cv[k][None], done.setpoint[k][None], done.mv[k - 1][None]
                 if not records:
-                    lanes.step(state, *told, dv=at(dv, k))  # compile before the clock starts
-                state, info = lanes.step(state, *told, dv=at(dv, k))
+                    lanes.step(state, *told, dv=dv(done.dv[k]))  # compile before the clock starts
+                state, info = lanes.step(state, *told, dv=dv(done.dv[k]))
                 records.append({name: value[0] for name, value in recorded(told[0], state, info).items()})
                 if progress is not None and (len(records) % REPORT == 0 or len(records) == total):
                     progress(len(records), total)

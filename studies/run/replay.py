@@ -152,7 +152,7 @@ class Wanted:
         setpoint = np.tile(np.asarray(constant, dtype=float), (count, 1))
         for i, name in self.setpoint.items():
             setpoint[:, i] = log.values[name]
-        stretches, begins = [], np.isfinite(cv).all(axis=1)
+        stretches, begins = [], np.all(np.isfinite(cv), axis=1)
         for own in log.segments:
             rows = np.flatnonzero(begins[own])
             if rows.size and own.stop - own.start - rows[0] >= LEAST:
@@ -221,7 +221,7 @@ def _shared(
     """What belongs to the log, and where the predictions of each sample began."""
     rows, begun = done.decided, done.begun
     setpoint = done.setpoint[rows]
-    window = np.concatenate([[0], np.cumsum((np.diff(setpoint, axis=0) != 0).any(axis=1))])
+    window = np.concatenate([[0], np.cumsum(np.any(np.diff(setpoint, axis=0) != 0, axis=1))])
     known = done.dv[rows] - done.dv[begun]
     course = np.zeros((len(rows), len(process.disturbances)))
     for j, name in enumerate(model.dv_names):

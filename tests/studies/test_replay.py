@@ -93,9 +93,10 @@ def test_the_log_of_a_run_gives_the_decisions_of_that_run_bit_for_bit(process, l
     run, rows = logged if kind == "mixed-integer" else closed(process, kind)
     folder = run_replay(process, written(tmp_path / "log.csv", rows), tmp_path, kind=kind, progress=False)
     data = open_results(folder).isel(controller=0).load()
+    fields = "cv setpoint mv mv_demand move bias plan objective status nodes"
     names = {"cv": "measurement", "mv": "position", "mv_demand": "demand"}
     np.testing.assert_array_equal(data.time.values, run.time + 10.0)  # since the first row of the log
-    for field in ("cv", "setpoint", "mv", "mv_demand", "move", "bias", "plan", "objective", "status", "nodes"):
+    for field in fields.split():
         np.testing.assert_array_equal(getattr(run, field), data[names.get(field, field)].values, field)
     assert (data.status.values == 0).all()
 
