@@ -57,9 +57,11 @@ def plan_at(data: xr.Dataset, controller: str, time: float) -> StoredPlan:
     run = _finished(data, controller)
     written = provenance(data, "definition")["controllers"]
     own: dict = next((entry for entry in written if entry["name"] == controller), {})
-    scheduled = own.get("schedule", False)
-    expected = "one with a single model; those of a gain schedule are not stored"
-    require(not scheduled, "controller", controller, expected)
+    other = own.get("schedule") or own.get("model")
+    expected = (
+        "one with the model of the process; those of a gain schedule and of a controller are not stored"
+    )
+    require(not other, "controller", controller, expected)
     dt = float(data.attrs["dt"])
     times = data.time.values
     k = int(np.searchsorted(times, time + 1e-9 * dt, side="right")) - 1 if np.isfinite(time) else -1

@@ -14,7 +14,7 @@ import io
 import os
 import sys
 
-from jaxmpc.cli import bench, explore, figures, identify, model, plan, process, replay, study
+from jaxmpc.cli import bench, explore, figures, identify, model, plan, process, replay, study, update
 from jaxmpc.cli.options import EXIT_BAD_INPUT, EXIT_OTHER, Command, complain, parser
 from jaxmpc.errors import InputError, MissingToolError, PlantError
 from jaxmpc.programs import interrupts
@@ -96,7 +96,7 @@ def _check_platform() -> None:
 
 COMMANDS = {
     command.words: command
-    for part in (plan, identify, model, process, study, replay, figures, explore, bench)
+    for part in (plan, identify, model, process, study, replay, update, figures, explore, bench)
     for command in vars(part).values()
     if isinstance(command, Command)
 }

@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
-from identify.plants import closing, disturbance_of
+from identify.plants import closing, disturbance_of, load_model
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.schedule import ModelSchedule, ScheduledController
 from jaxmpc.errors import InputError
@@ -82,17 +82,18 @@ def run_comparison(
     scheduled: dict[str, Any] = {}
     if schedule is not None:
         scheduled["schedule"] = [np.asarray(part) for part in (*schedule.grid, schedule.coefficients)]
-    hashes = [
-        content_hash(inputs | (scheduled if controller.schedule else {}), controller.resolved(process))
-        for controller in definition.controllers
-    ]
+    models = [load_model(process, one.model) if one.model else model for one in definition.controllers]
+    hashes = []
+    for controller, own in zip(definition.controllers, models, strict=True):
+        known = inputs | {"model": np.asarray(own.coefficients)} | (scheduled if controller.schedule else {})
+        hashes.append(content_hash(known, controller.resolved(process)))
     study_hash = content_hash(FORMAT, msgspec.to_builtins(definition), hashes)
     layout = comparison_layout(definition, process, model, extra, hashes, study_hash, plant_facts, code)
 
     def run(i: int) -> Trajectory:
         controller = definition.controllers[i]
         given = {"schedule": schedule} if controller.schedule else {}
-        return run_controller(controller, definition, process, model, make_plant, progress, **given)
+        return run_controller(controller, definition, process, models[i], make_plant, progress, **given)
 
     return run_missing(folder, layout, run, say, others)
 

@@ -16,6 +16,7 @@ import numpy as np
 import xarray as xr
 
 from identify.logged.log import Log, read_log
+from identify.logged.tags import Tags, tags_of
 from identify.plants import model_of
 from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError, near
@@ -85,13 +86,14 @@ def run_replay(
     controller.check(process, np.inf)
     name = f"{process.name}-{re.sub('[^A-Za-z0-9_.-]', '-', Path(log).stem)}-replay"
     folder = check_writable(Path(out) / name)
-    wanted = Wanted.of(process, model_of(process))
-    read = wanted.read(log, time)
+    model = model_of(process)
+    tags = tags_of(process, model)
+    read = _read(process, tags, log, time)
     for note in read.notes:
         say(f"Log: {note}.")
-    done = wanted.done(read, process.reference(reference or None).setpoints[0], say)
-    layout = _layout(process, wanted.model, controller, done, name, Path(log).name, read)
-    controls = Controller(controller.structure(process), controller.build_tuning(process), wanted.model)
+    done = _done(process, tags, read, process.reference(reference or None).setpoints[0], say)
+    layout = _layout(process, model, controller, done, name, Path(log).name, read)
+    controls = Controller(controller.structure(process), controller.build_tuning(process), model)
 
     def run(_: int) -> Trajectory:
         with progress_bar("replay", progress) as report:
@@ -101,74 +103,48 @@ def run_replay(
         return run_missing(folder, layout, run, say)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Wanted:
-    """What a replay reads of a log: columns of CVs, MVs, measured disturbances and setpoints.
+def _read(process: Process, tags: Tags, path: str | Path, time: str | None) -> Log:
+    """The log at the sampling interval of the process; nothing that was measured is left out."""
+    held = [*tags.inputs, *_setpoint_tags(process).values()]
+    columns = list(dict.fromkeys([*tags.cv, *held]))
+    return read_log(path, columns, process.dt, time, held=held, hold=np.inf, clean=False)
 
-    Attributes:
-        process: whose tags they are.
-        model: of its controller, whose measured disturbances are read.
-        cv, mv, dv: columns.
-        setpoint: columns by the place of the CV, of those that have one.
+
+def _setpoint_tags(process: Process) -> dict[int, str]:
+    """Columns of setpoints by the place of their CV."""
+    return {i: cv.setpoint_tag for i, cv in enumerate(process.cvs) if cv.setpoint_tag}
+
+
+def _done(process: Process, tags: Tags, log: Log, constant: np.ndarray, say: Callable[[str], None]) -> Done:
+    """The log as a controller is told it.
+
+    Args:
+        constant: setpoints where the log has none, ``"cv"`` [CV unit].
+
+    Raises:
+        InputError: for a log without two rows in a row that have all CVs at the first.
     """
-
-    process: Process
-    model: StepResponseModel
-    cv: list[str]
-    mv: list[str]
-    dv: list[str]
-    setpoint: dict[int, str]
-
-    @classmethod
-    def of(cls, process: Process, model: StepResponseModel) -> Wanted:
-        """Of a process and its model."""
-        tags = {variable.name: variable.column for variable in process.disturbances}
-        return cls(
-            process,
-            model,
-            [cv.column for cv in process.cvs],
-            [mv.column for mv in process.mvs],
-            [tags.get(name, name) for name in model.dv_names],
-            {i: cv.setpoint_tag for i, cv in enumerate(process.cvs) if cv.setpoint_tag},
-        )
-
-    def read(self, path: str | Path, time: str | None) -> Log:
-        """The log at the sampling interval of the process; nothing that was measured is left out."""
-        held = [*self.mv, *self.dv, *self.setpoint.values()]
-        columns = list(dict.fromkeys([*self.cv, *held]))
-        return read_log(path, columns, self.process.dt, time, held=held, hold=np.inf, clean=False)
-
-    def done(self, log: Log, constant: np.ndarray, say: Callable[[str], None] = print) -> Done:
-        """The log as a controller is told it.
-
-        Args:
-            constant: setpoints where the log has none, ``"cv"`` [CV unit].
-
-        Raises:
-            InputError: for a log without two rows in a row that have all CVs at the first.
-        """
-        table = lambda names: np.stack([log.values[name] for name in names], axis=1)  # noqa: E731
-        cv, count = table(self.cv), len(log.times)
-        setpoint = np.tile(np.asarray(constant, dtype=float), (count, 1))
-        for i, name in self.setpoint.items():
-            setpoint[:, i] = log.values[name]
-        stretches, begins = [], np.all(np.isfinite(cv), axis=1)
-        for own in log.segments:
-            rows = np.flatnonzero(begins[own])
-            if rows.size and own.stop - own.start - rows[0] >= LEAST:
-                stretches.append(slice(own.start + int(rows[0]), own.stop))
-        if not stretches:
-            raise InputError("log", f"{count} rows", "two rows in a row, the first with a value of every CV")
-        names, given = self.process.cv_names, self.setpoint
-        fixed = ", ".join(
-            f"{names[i]} {constant[i]:g} {self.process.cvs[i].unit}".removesuffix(" 1")
-            for i in range(len(names))
-            if i not in given
-        )
-        if fixed:
-            say(f"Log: setpoints that it does not have are taken from the reference: {fixed}.")
-        dv = table(self.dv) if self.dv else np.zeros((count, 0))
-        return Done(log.times, cv, setpoint, table(self.mv), dv, stretches)
+    count, given = len(log.times), _setpoint_tags(process)
+    table = lambda names: np.stack([log.values[name] for name in names], axis=1)  # noqa: E731
+    cv, setpoint = table(tags.cv), np.tile(np.asarray(constant, dtype=float), (count, 1))
+    for i, name in given.items():
+        setpoint[:, i] = log.values[name]
+    stretches, begins = [], np.all(np.isfinite(cv), axis=1)
+    for own in log.segments:
+        rows = np.flatnonzero(begins[own])
+        if rows.size and own.stop - own.start - rows[0] >= LEAST:
+            stretches.append(slice(own.start + int(rows[0]), own.stop))
+    if not stretches:
+        raise InputError("log", f"{count} rows", "two rows in a row, the first with a value of every CV")
+    fixed = ", ".join(
+        f"{one.name} {constant[i]:g} {one.unit}".removesuffix(" 1")
+        for i, one in enumerate(process.cvs)
+        if i not in given
+    )
+    if fixed:
+        say(f"Log: setpoints that it does not have are taken from the reference: {fixed}.")
+    dv = table(tags.dv) if tags.dv else np.zeros((count, 0))
+    return Done(log.times, cv, setpoint, table(tags.mv), dv, stretches)
 
 
 def _layout(
