@@ -1,11 +1,10 @@
-"""What `jaxmpc update` writes beside a new model: a process with it, and the study that compares both models in closed loop.
+"""What `jaxmpc update` writes beside a new model: the study that compares both models in closed loop, and its process.
 
 The new model is the plant of the study, so that it answers what the present one costs if the new one is right.
 """
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -33,20 +32,24 @@ def write_proposal(
     files = proposal_files(out)
     updated.save(out)
     present.save(files["present"])
-    write_atomically(files["process"], toml_text(_process(process, out)))
+    write_atomically(files["process"], toml_text(_process(process, updated, out)))
     write_atomically(files["study"], _study(process, out, files))
     return [out, files["present"], files["process"], files["study"]]
 
 
-def _process(process: Process, out: Path) -> dict[str, Any]:
-    """The content of the process file with the new model, which is also its first plant."""
-    body = {key: value for key, value in process.body.items() if key not in ("model", "plants")}
-    near = lambda source: os.path.relpath(Path(process.folder) / source, out.parent)  # noqa: E731
-    plants: dict[str, Any] = {PLANT: {"kind": "model", "source": out.name}}
-    for name, plant in process.body.get("plants", {}).items():
-        if plant["kind"] == "fmu" or (plant["kind"] == "model" and plant.get("source")):
-            plants.setdefault(name, {**plant, "source": near(plant["source"])})
-    return body | {"model": {"file": out.name}, "plants": plants}
+def _process(process: Process, updated: StepResponseModel, out: Path) -> dict[str, Any]:
+    """The content of the process file with the new model, which is also its plant, and disturbances that it has."""
+    body = dict(process.body)
+    for key in ("model", "plants", "disturbance", "disturbances"):
+        body.pop(key, None)
+    own = {*updated.dv_names, *(f"output.{name}" for name in process.cv_names)}
+    given = process.body.get("disturbance", [])
+    kept = [one for one in given if one["name"] in own]
+    body |= {"disturbance": kept} if kept else {}
+    if len(kept) == len(given) and "disturbances" in process.body:
+        body["disturbances"] = process.body["disturbances"]
+    plant = {"kind": "model", "source": out.name}
+    return body | {"model": {"file": out.name}, "plants": {PLANT: plant}}
 
 
 def _study(process: Process, out: Path, files: dict[str, Path]) -> str:
