@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -211,9 +212,8 @@ def _least(
 
     def solved(start: np.ndarray, tries: int):
         start = np.clip(start.ravel(), *bounds)
-        return least_squares(
-            residuals, start, slopes, bounds, x_scale=prior.ravel(), max_nfev=tries, xtol=1e-6
-        )
+        given: dict[str, Any] = dict(jac=slopes, bounds=bounds, x_scale=prior.ravel())
+        return least_squares(residuals, start, **given, max_nfev=tries, xtol=1e-6)
 
     best = solved(x, 3 * TRIES)
     for j in range(len(x)):

@@ -32,15 +32,15 @@ def replay(options: Options) -> int:
     from studies.kpi.replay import write_summary
     from studies.run.replay import run_replay
 
-    given = {key: getattr(options, key) or "" for key in ("preset", "reference")}
     folder = run_replay(
         load_process(options.process),
         options.log,
         options.out,
         kind=options.controller or "",
+        preset=options.preset or "",
+        reference=options.reference or "",
         time=options.time,
         progress=not is_quiet(),
-        **given,
     )
     from figures.registry import draw_study
 

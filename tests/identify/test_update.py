@@ -79,6 +79,7 @@ def test_gains_and_dead_times_of_a_closed_loop_are_within_their_intervals(proces
     model = model_of(process)
     found = update_model(process, model, written(tmp_path / "log.csv", closed_loop(1)))
     assert [row.verdict for row in found.verdicts] == ["good", "good"]
+    assert found.bands is not None
     final = found.responses[0, :, -1]
     np.testing.assert_array_less(np.abs(final - [0.6, -0.68]), found.bands[0, :, -1])
     assert np.abs(final / [0.5, -0.8] - [1.2, 0.85]).max() < 0.1
@@ -112,6 +113,7 @@ def test_what_the_log_cannot_tell_keeps_its_response(process, tmp_path):
     kept = found.responses[0, 1]
     np.testing.assert_array_equal(kept[:40], np.asarray(model.coefficients)[0, 1])
     assert (kept[40:] == kept[39]).all()
+    assert found.bands is not None
     assert np.isnan(found.bands[0, 1]).all()
 
 
