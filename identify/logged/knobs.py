@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from identify.logged.noise import Noise, likeliest, whitened
+from identify.logged.noise import CANDIDATES, Noise, likeliest, whitened
 from identify.logged.regression import free_columns, predicted
 from jaxmpc.process.model_plant import NOTHING, warped
 
@@ -138,15 +138,18 @@ class _Errors:
     """Prediction errors under one noise model, offsets and free responses eliminated: linear in what is not explained."""
 
     def __init__(self, case: Case, noise: Noise, free: float):
-        self.case, self.noise, self.parts = case, noise, []
+        self.case, self.noise, self.parts, self.constant = case, noise, [], 0.0
         for own in case.segments:
             known = np.isfinite(case.output[own])
             if not known.any():
                 continue
             columns, precision = free_columns(len(known), case.nominal.shape[1], free)
             root = np.sqrt(precision)
-            white = self._white(columns, known)
-            solve = np.linalg.solve(white.T @ white + np.diag(precision), white.T)
+            found = list(whitened(noise, iter([columns]), known))
+            white = np.concatenate([rows for rows, _ in found])
+            inner = white.T @ white + np.diag(precision)
+            self.constant += sum(logs for _, logs in found) + np.linalg.slogdet(inner)[1]
+            solve = np.linalg.solve(inner, white.T)
             self.parts.append((own, known, columns, white, root, solve))
 
     def _white(self, values: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -160,6 +163,17 @@ class _Errors:
             z = solve @ rows
             out += [rows - white @ z, root[:, None] * z]
         return np.concatenate(out)
+
+    def score(self, x: Float[np.ndarray, "input 3"], slopes: Float[np.ndarray, "sample p"]) -> float:
+        """Twice the negative logarithm of the likelihood of the noise, all that is estimated integrated out, near `x`."""
+        case, precision = self.case, np.diag(self.case.prior.ravel() ** -2)
+        rows = self.of(np.column_stack([case.output - case.explained(x), slopes]))
+        left, slope, count = rows[:, 0], rows[:, 1:], int(np.isfinite(case.output).sum())
+        variance = float((left**2).sum()) / count
+        change = np.linalg.solve(slope.T @ slope + variance * precision, slope.T @ left)
+        variance = float(((left - slope @ change) ** 2).sum()) / count
+        known = np.linalg.slogdet(slope.T @ slope / variance + precision)[1]
+        return count * np.log(variance) + self.constant + known
 
     def left(self, values: Float[np.ndarray, " sample"]) -> list[Float[np.ndarray, " sample"]]:
         """What offsets and free responses leave of a series, by segment and unfiltered."""
@@ -182,7 +196,7 @@ def fit_knobs(case: Case) -> Found:
         now = likeliest(errors.left(alone))
         if now == noise:
             break
-        noise, errors = now, _Errors(case, now, variance / size)
+        noise, errors = now, _likeliest_near(case, now, variance / size, x)
         variance = max(float((errors.of(alone[:, None]) ** 2).sum()) / count, 1e-12 * size)
         x = _least(case, errors, x, x0, variance, shifts=SHIFTS if turn == 0 else ())
         alone = case.output - case.explained(x)
@@ -190,6 +204,29 @@ def fit_knobs(case: Case) -> Found:
     information = errors.of(case.slopes(x))
     information = information.T @ information / variance + np.diag(case.prior.ravel() ** -2)
     return Found(x, np.linalg.inv(information), errors.noise, variance)
+
+
+def _likeliest_near(case: Case, noise: Noise, free: float, x: np.ndarray) -> _Errors:
+    """The likeliest noise beside a first guess, which is that of residuals and takes what was fitted for none of it."""
+    grid = [sorted({one[k] for one in CANDIDATES}) for k in range(2)]
+    slopes, tried = case.slopes(x), {}
+
+    def score(one: Noise) -> float:
+        if one not in tried:
+            errors = _Errors(case, one, free)
+            tried[one] = errors.score(x, slopes), errors
+        return tried[one][0]
+
+    def beside(one: Noise, other: Noise) -> bool:
+        apart = [abs(own.index(one[k]) - own.index(other[k])) for k, own in enumerate(grid)]
+        return one.white == other.white and max(apart) <= 1
+
+    while noise in CANDIDATES:
+        best = min((one for one in CANDIDATES if beside(noise, one)), key=score)
+        if best == noise:
+            break
+        noise = best
+    return tried[noise][1] if noise in tried else _Errors(case, noise, free)
 
 
 def _least(
