@@ -7,12 +7,18 @@ import pytest
 
 from identify.logged.knobs import Case, fit_knobs
 from identify.logged.update import HALF, update_model
-from identify.plants import model_of
+from identify.plants import model_of, open_plant
 from jaxmpc.cli.main import main
+from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
 from jaxmpc.files import toml_text
-from jaxmpc.process.file import load_process, process_of
+from jaxmpc.loop.simulate import simulate
+from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.process.file import process_of
 from studies.definition.catalogue import load_comparison
+from studies.plans import plan_at
+from studies.run.named import run_named
+from studies.store.reading import open_results
 
 BODY = {
     "name": "mixer",
@@ -94,12 +100,12 @@ def test_gains_and_dead_times_of_a_closed_loop_are_within_their_intervals(proces
 def test_intervals_hold_as_often_as_they_say(process):
     nominal = np.asarray(model_of(process).coefficients)[0]
     hits = []
-    for seed in range(12):
-        rows = closed_loop(seed, 600)
+    for seed in range(8):
+        rows = closed_loop(seed, 400)
         found = fit_knobs(Case(nominal, rows[:, 1:] - rows[0, 1:], rows[:, 0], [slice(0, len(rows))]))
         hits.append(np.abs(found.x[:, :2] - TRUE) <= HALF * found.deviations[:, :2])
-    # 48 intervals, not all independent, of 95 %: less than 85 % has a probability below 1 %
-    assert np.mean(hits) >= 0.85
+    # of 32 intervals of 95 %, of which those of one log depend on each other, 26 or fewer hold in one case of fifty
+    assert np.sum(hits) > 26
 
 
 def test_what_the_log_cannot_tell_keeps_its_response(process, tmp_path):
@@ -140,7 +146,7 @@ def test_a_model_that_is_right_stays_within_its_intervals(process, tmp_path):
     assert all("no change within the intervals" in row.says for row in found.verdicts)
 
 
-def test_the_command_writes_a_proposal_whose_study_has_both_models(process, tmp_path, monkeypatch, capsys):
+def test_the_command_writes_a_proposal_whose_study_runs_both_models(process, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     body = {key: value for key, value in BODY.items() if key != "plants"} | {"disturbance": []}
     (tmp_path / "mixer.toml").write_text(toml_text(body))
@@ -155,8 +161,20 @@ def test_the_command_writes_a_proposal_whose_study_has_both_models(process, tmp_
     assert [(one.name, one.model) for one in study.definition.controllers] == [
         *(("present", "new-present.json"), ("updated", "new.json"))
     ]
-    np.testing.assert_array_equal(
-        model_of(load_process("new-process.toml")).coefficients, model_of(study.process).coefficients
+    data = open_results(run_named(study, progress=False, say=lambda line: None)).load()
+    for name, file in (("present", "new-present.json"), ("updated", "new.json")):
+        model = StepResponseModel.load(tmp_path / file)
+        structure = study.process.structure()
+        controller = Controller(structure, study.process.tuning(structure), model)
+        alone = simulate(controller, open_plant(study.process), study.process.reference())
+        np.testing.assert_array_equal(data.position.sel(controller=name).values, alone.mv)
+        with pytest.raises(InputError, match="model of the process"):
+            plan_at(data, name, 100.0)
+    # a controller whose model is its plant sees no bias but rounding
+    assert (
+        np.abs(data.bias.sel(controller="updated")).max()
+        < 1e-9
+        < np.abs(data.bias.sel(controller="present")).max()
     )
 
 
