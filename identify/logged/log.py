@@ -228,9 +228,8 @@ def _on_grid(
                     columns[name].append(made[name][part])
     for name, count in lost.items():
         if count:
-            notes.append(
-                f"{name}: {count} samples without a value within {hold:g} samples are left out, which parts the log"
-            )
+            where = f"within {hold:g} samples" if np.isfinite(hold) else "until then"
+            notes.append(f"{name}: {count} samples without a value {where} are left out, which parts the log")
         if moved_within[name]:
             notes.append(f"{name} moves between two samples {moved_within[name]} times; seen at the next one")
     count = sum(map(len, times))

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,6 +29,7 @@ from jaxmpc.process.process import Process
 
 PRESENT = "present model"  # its name among the alternatives
 TOLD = 0.5  # of the standard deviation that a gain factor has beforehand: more is not told
+ROWS = 10  # measurements per input that a fit takes at least
 HALF = 1.96 * WIDER  # half widths of 95 % intervals in standard deviations
 
 
@@ -115,25 +117,30 @@ def _updated(
     )
     acts = (np.abs(nominal).max(axis=1) > 0) & (np.abs(moved).max(axis=0) > 0)
     places = np.flatnonzero(acts)
-    if not places.size or np.isfinite(output).sum() < 10 * places.size:
+    known, least = np.isfinite(output), ROWS * max(places.size, 1)
+    if not places.size or known.sum() < least:
         bar.update(2)
         return _Cv(None, places, None, np.full(len(output), np.nan), None)
     case = Case(nominal[places], moved[:, places], output, log.segments)
-    early = np.where(np.arange(len(output)) < cut, output, np.nan)
-    first = fit_knobs(Case(case.nominal, case.inputs, early, log.segments))
-    bar.update()
     found = fit_knobs(case)
+    bar.update()
+    fits = None
+    if known[:cut].sum() >= least and known[cut:].any():
+        early = np.where(np.arange(len(output)) < cut, output, np.nan)
+        first = fit_knobs(dataclasses.replace(case, output=early))
+        old = np.tile([1.0, 0.0, 0.0], (len(places), 1))
+        left = (output - case.explained(x) for x in (old, first.x))
+        late = [_unforeseen(one, first, log)[cut:] for one in left]
+        before, after = (float(np.sqrt(np.nanmean(one**2))) for one in late)
+        fits = before, after
     bar.update()
     alone = case.explained(found.x)
     errors = _unforeseen(output - alone, found, log)
-    old = np.tile([1.0, 0.0, 0.0], (len(places), 1))
-    late = [_unforeseen(output - case.explained(x), first, log)[cut:] for x in (old, first.x)]
-    fits = tuple(float(np.sqrt(np.nanmean(one**2))) if np.isfinite(one).any() else np.nan for one in late)
     for own in log.segments:
         y = output[own] - alone[own]
         alone[own] += np.nanmean(y) if np.isfinite(y).any() else np.nan
     tested = examined(errors, inputs, log.segments, nominal.shape[1])
-    return _Cv(found, places, tested, alone, fits)  # pyright: ignore[reportArgumentType]
+    return _Cv(found, places, tested, alone, fits)
 
 
 def _unforeseen(left: np.ndarray, found: Found, log: Log) -> np.ndarray:
@@ -217,7 +224,7 @@ def _notes(
         if own.found is None:
             continue
         notes.append(f"{name}: the noise is {own.found.noise}")
-        if own.fits is not None and np.isfinite(own.fits).all():
+        if own.fits is not None:
             old, new = own.fits
             notes.append(
                 f"{name}: of the last {len(log.times) - cut} samples, which a first fit did not see, what cannot be "
