@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from identify.logged.knobs import Case, fit_knobs
+from identify.logged.proposal import write_proposal
 from identify.logged.update import HALF, update_model
 from identify.plants import model_of, open_plant
 from jaxmpc.cli.main import main
@@ -13,8 +14,8 @@ from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
 from jaxmpc.files import toml_text
 from jaxmpc.loop.simulate import simulate
-from jaxmpc.model.step_response import StepResponseModel
-from jaxmpc.process.file import process_of
+from jaxmpc.model.step_response import StepResponseModel, make_model
+from jaxmpc.process.file import load_process, process_of
 from studies.definition.catalogue import load_comparison
 from studies.plans import plan_at
 from studies.run.named import run_named
@@ -176,6 +177,17 @@ def test_the_command_writes_a_proposal_whose_study_runs_both_models(process, tmp
         < 1e-9
         < np.abs(data.bias.sel(controller="present")).max()
     )
+
+
+@pytest.mark.parametrize("name", ["gas-lifted-well", "pump-tank", "wood-berry"])
+def test_the_study_is_accepted_whatever_the_plants_and_disturbances_of_the_process(name, tmp_path):
+    known = load_process(name)
+    steps = np.tile(np.linspace(0.1, 1.0, 20), (len(known.cvs), len(known.mvs), 1))
+    model = make_model(steps, known.dt, known.cv_names, known.mv_names)
+    write_proposal(known, model, model, tmp_path / "new.json")
+    study = load_comparison(tmp_path / "new-study.toml")
+    assert list(study.process.plants) == ["updated"]
+    assert open_plant(study.process).cv_names == known.cv_names
 
 
 def test_a_log_that_tells_nothing_leaves_nothing_behind(tmp_path, monkeypatch, capsys):
