@@ -171,7 +171,7 @@ def _layout(
         controllers=LABELS,
         hashes=hashes,
         structure=structure,
-        samples=demanded.samples(structure.dt),
+        times=structure.dt * np.arange(demanded.samples(structure.dt)),
         blocks=structure.block_count,
         shared=lambda: shared,
         provenance=provenance,
