@@ -74,7 +74,7 @@ def points(store: str | Path) -> Runs:
     axes: dict[str, SweepAxis] = {}
     if is_comparison(store):
         data = completed(open_results(store))
-        figures = key_figures(data).load()
+        figures = key_figures(data).load().assign_attrs(data.attrs)  # which process they are of
         title, numbers, names = "controller", np.arange(data.sizes["controller"]), data.label.values.tolist()
         groups = names
     else:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import xarray as xr
 
-from figures import style
+from figures import replay, style
 from figures.comparison import overview, tracking, wear
 from figures.comparison import summary as comparison_summary
 from figures.figure import FigureEntry
@@ -97,7 +97,7 @@ def draw_study(folder: str | Path, kind: str) -> list[Path]:
     Args:
         folder: of its results.
         kind: `studies.definition.catalogue.Comparison.kind`; those of the thesis have their own figures, any other the ones
-            of `comparison_figures`.
+            of `comparison_figures`; ``replay`` has one of its own.
 
     Returns:
         The files written.
@@ -106,14 +106,17 @@ def draw_study(folder: str | Path, kind: str) -> list[Path]:
         InputError: if no run of it is finished, or not one that a figure needs.
     """
     data, out = open_results(folder).load(), Path(folder) / "figures"
-    entries = [entry for entry in FIGURES.values() if entry.study == kind] or comparison_figures(data)
+    entries = [entry for entry in FIGURES.values() if entry.study == kind] or other_figures(data, kind)
     _check_finished(entries, data)
     shown = [(entry, data) for entry in entries]
     title, process = str(data.attrs.get("title", "")), process_in(data)
-    return [
-        *_drawn(entries, data, out),
-        write_page(shown, out, title, f"{process.title}: every run of one comparison."),
-    ]
+    about = "a controller on logged data" if kind == replay.STUDY else "every run of one comparison"
+    return [*_drawn(entries, data, out), write_page(shown, out, title, f"{process.title}: {about}.")]
+
+
+def other_figures(data: xr.Dataset, kind: str) -> list[FigureEntry]:
+    """Those of a replay, or of a comparison of any process."""
+    return list(replay.ENTRIES) if kind == replay.STUDY else comparison_figures(data)
 
 
 def comparison_figures(data: xr.Dataset) -> list[FigureEntry]:

@@ -48,7 +48,7 @@ def build_controller_fmu(
         MissingToolError: without PythonFMU.
     """
     if not isinstance(controller, Controller):
-        raise InputError("controller", type(controller).__name__, "a Controller, without targets of MVs")
+        raise InputError("controller", type(controller).__name__, "a Controller")
     path = check_fmu_target("path", path)
     starts = _checked_start(controller, dict(start or {}))
     try:

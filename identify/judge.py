@@ -12,10 +12,13 @@ from scipy.optimize import lsq_linear
 
 from identify.step_test import response_words, settling
 from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.problem.structure import Structure
+from jaxmpc.problem.tuning import FIELDS, Tuning
 from jaxmpc.process.process import Process, amount
 
 NOTHING = 1e-4  # spans of a CV per span of an MV: no response
 FAST, SLOW = 3, 0.9  # samples to 63 % of a gain; share of the model's length
+GIVES_WAY = 0.5  # spans that setpoints may be off at least while CV limits come before them
 ILL = 30.0  # condition number of the gains in spans from which on directions differ much
 Level = Literal["fine", "look"]
 
@@ -29,14 +32,15 @@ class Finding(NamedTuple):
 
 
 def judge(process: Process, model: StepResponseModel) -> list[Finding]:
-    """Everything that is found, in the order of the file: pairs, horizons, gains, steps, references.
+    """Everything that is found, in the order of the file: pairs, horizons, gains, steps, priorities, references.
 
     Args:
         process: checked already.
         model: of the process.
     """
     found = [*_told(model), *_pairs(process, model), *_horizons(process, model), *_gains(process, model)]
-    return [*found, *_steps(process, model), *_references(process, model)]
+    found += [*_steps(process, model), *_limits(process, model), *_ideals(process)]
+    return [*found, *_references(process, model)]
 
 
 def _told(model: StepResponseModel) -> list[Finding]:
@@ -144,6 +148,78 @@ def _steps(process: Process, model: StepResponseModel) -> list[Finding]:
                 out.append(Finding("look", f"{mv.name} on {cv.name}", words))
             else:
                 out.append(Finding("fine", f"{mv.name} on {cv.name}", words))
+    return out
+
+
+def limit_prices(
+    structure: Structure, tuning: Tuning, gains: np.ndarray, cv_span: np.ndarray, mv_span: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The `slack_weight` from which on a CV limit is kept before anything else is, ``"cv"`` [1/CV unit].
+
+    An exact penalty keeps a limit if its price is above the sum of the limit's multipliers over the horizon, which is what
+    keeping it by one unit costs elsewhere. This bounds it for a steady state in which the MV does it that costs least.
+
+    Args:
+        gains: ``"cv mv"`` [CV unit per MV unit].
+        cv_span, mv_span: how far all CVs are off their setpoints, and the MVs off their ideal values.
+
+    Returns:
+        ``(fixed, by_span)``: the part that does not depend on how far they are off, and the rest; infinite where no MV moves
+        the CV.
+    """
+    samples = structure.prediction_horizon - structure.first_penalised + 1
+    curved = 2.0 * samples * np.asarray(tuning.cv_weight + tuning.soft_quadratic) * cv_span
+    straight = samples * np.asarray(tuning.soft_linear)
+    rest = 2.0 * samples * np.asarray(tuning.ideal_weight) * mv_span
+    size = np.abs(gains)
+    moves = size * mv_span > NOTHING * cv_span[:, None]
+    # MV units per unit of the CV; what that costs by every MV, and by the cheapest
+    needed = np.where(moves, 1.0 / np.where(moves, size, 1.0), np.inf)
+    fixed, by_span = (
+        needed * np.where(np.isinf(needed), 1.0, cost) for cost in (straight @ size, curved @ size + rest)
+    )
+    cheapest = np.arange(len(size)), np.argmin(fixed + by_span, axis=1)
+    return fixed[cheapest], by_span[cheapest]
+
+
+def _limits(process: Process, model: StepResponseModel) -> list[Finding]:
+    """Whether the limits of the CVs come before their setpoints."""
+    structure = process.structure()
+    tuning, out = process.tuning(structure), []
+    spans = (np.array([v.span for v in own]) for own in (process.cvs, process.mvs))
+    fixed, by_span = limit_prices(structure, tuning, np.asarray(model.coefficients)[:, :, -1], *spans)
+    for i, cv in enumerate(process.cvs):
+        if not np.isfinite([tuning.cv_low[i], tuning.cv_high[i]]).any():
+            continue
+        subject = f"limits of {cv.name}"
+        unit = "" if cv.unit == "1" else f" {FIELDS['slack_weight'].unit_of(cv.unit)}"
+        price, needed = float(tuning.slack_weight[i]), fixed[i] + by_span[i]
+        if not np.isfinite(needed):
+            out.append(Finding("look", subject, "no MV moves it: nothing keeps it within its limits"))
+            continue
+        words = (
+            f"slack_weight {price:.4g}{unit}; {needed:.3g} keeps them while setpoints are off by their spans"
+        )
+        share = 1.0 if price >= needed else max(price - fixed[i], 0.0) / max(by_span[i], 1e-300)
+        if share < GIVES_WAY:
+            words += f", this one up to {share:.2g} of them: setpoints farther off come before these limits"
+        out.append(Finding("look" if share < GIVES_WAY else "fine", subject, words))
+    return out
+
+
+def _ideals(process: Process) -> list[Finding]:
+    """Whether the MVs can be at their ideal values, in every preset."""
+    out = []
+    for preset in process.presets:
+        tuning = process.tuning(process.structure(), preset)
+        for i, mv in enumerate(process.mvs):
+            if not tuning.ideal_weight[i]:
+                continue
+            ideal, low, high = (float(v[i]) for v in (tuning.ideal, tuning.mv_low, tuning.mv_high))
+            words, level = f"{amount(ideal, mv.unit)}, limits {low:g} to {high:g}", "fine"
+            if not low <= ideal <= high:
+                level, words = "look", words + ": out of reach; it pulls to the nearer limit all the time"
+            out.append(Finding(level, f"presets.{preset}.ideal.{mv.name}", words))
     return out
 
 

@@ -42,7 +42,6 @@ _HOME_OF = {
     "SteadyMap": "steady.map",
     "StepResponseModel": "model.step_response",
     "Structure": "problem.structure",
-    "TargetController": "controller.targets",
     "Trajectory": "loop.trajectory",
     "WellPlant": "process.well.plant",
     "fault_errors": "controller.measurement",

@@ -7,7 +7,6 @@ from jaxmpc.controller.controller import Controllers as Controllers
 from jaxmpc.controller.measurement import SensorFault as SensorFault
 from jaxmpc.controller.measurement import fault_errors as fault_errors
 from jaxmpc.controller.plan import solve_plan as solve_plan
-from jaxmpc.controller.targets import TargetController as TargetController
 from jaxmpc.errors import InputError as InputError
 from jaxmpc.loop.events import Event as Event
 from jaxmpc.loop.simulate import simulate as simulate

@@ -14,6 +14,8 @@ import xarray as xr
 from jaxmpc.check import require
 from studies.store.reading import provenance
 
+BREAK = 1.5  # sampling intervals between two samples from which on there is a gap
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StoredPlan:
@@ -36,6 +38,11 @@ class StoredPlan:
         return self.time + self.dt * np.arange(1, len(self.cv) + 1)
 
 
+def begins(data: xr.Dataset) -> np.ndarray:
+    """Whether a sample is the first of a stretch without gaps, ``"sample"``: of a run, or of a log that was replayed."""
+    return np.diff(data.time.values, prepend=-np.inf) > BREAK * float(data.attrs["dt"])
+
+
 def plan_at(data: xr.Dataset, controller: str, time: float) -> StoredPlan:
     """The plan that a controller made at a time, with its prediction.
 
@@ -49,20 +56,30 @@ def plan_at(data: xr.Dataset, controller: str, time: float) -> StoredPlan:
     """
     run = _finished(data, controller)
     written = provenance(data, "definition")["controllers"]
-    scheduled = any(entry.get("schedule") for entry in written if entry["name"] == controller)
-    expected = "one with a single model; those of a gain schedule are not stored"
-    require(not scheduled, "controller", controller, expected)
+    own: dict = next((entry for entry in written if entry["name"] == controller), {})
+    other = own.get("schedule") or own.get("model")
+    expected = (
+        "one with the model of the process; those of a gain schedule and of a controller are not stored"
+    )
+    require(not other, "controller", controller, expected)
     dt = float(data.attrs["dt"])
     times = data.time.values
-    k = int(np.floor(time / dt + 1e-9)) if np.isfinite(time) else -1
-    require(0 <= k < len(times), "time", time, f"a time of the run, {times[0]:g} to {times[-1]:g} s")
+    k = int(np.searchsorted(times, time + 1e-9 * dt, side="right")) - 1 if np.isfinite(time) else -1
+    require(
+        k >= 0 and time < times[-1] + dt, "time", time, f"a time of the run, {times[0]:g} to {times[-1]:g} s"
+    )
     move = _sample_moves(run, run.plan.values[k])
     expected = "a time at which a plan was made, not one at which a plan is carried out"
     require(not np.isnan(move).any(), "time", time, expected)
-    made = run.move.values[:k]
     horizon = int(run.prediction_horizon)
     steps = data.model_coefficient.values  # "cv mv lag", S(1)..S(N)
-    cv = run.measurement.values[0] + run.bias.values[k] + np.zeros((horizon, 1))
+    begin = int(np.flatnonzero(begins(data)[: k + 1])[-1])  # a replay begins anew behind a gap of its log
+    run, k = run.isel(time=slice(begin, None)), k - begin
+    base = run.base.values[k] if "base" in run else run.measurement.values[0]
+    made = run.move.values[:k]
+    if "base" in run or own.get("position_feedback"):  # predictions are from where the MVs stood
+        made = run.position.values[:k] - run.demand.values[:k] + made
+    cv = base + run.bias.values[k] + np.zeros((horizon, 1))
     for i in np.flatnonzero(made.any(axis=1)).tolist():
         cv += _response(steps, made[i], horizon, k - i)
     if "dv" in run:  # what measured disturbances did is fed forward
@@ -72,7 +89,7 @@ def plan_at(data: xr.Dataset, controller: str, time: float) -> StoredPlan:
     for i in np.flatnonzero(move.any(axis=1)).tolist():
         cv[i:] += _response(steps, move[i], horizon - i, 0)
     before = run.demand.values[k] - run.move.values[k]
-    return StoredPlan(float(times[k]), move, before + np.cumsum(move, axis=0), cv, dt)
+    return StoredPlan(float(run.time.values[k]), move, before + np.cumsum(move, axis=0), cv, dt)
 
 
 def _finished(data: xr.Dataset, controller: str) -> xr.Dataset:

@@ -6,13 +6,11 @@ import numpy as np
 
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.schedule import ScheduledController, make_schedule
-from jaxmpc.controller.targets import TargetController
 from jaxmpc.problem.tuning import make_tuning
 
 START = np.array([11000.0, 185.0]), np.array([50.0, 7500.0])
 SETPOINT = np.array([12500.0, 205.0])
-TARGET = np.array([55.0, 0.0])
-KINDS = ("continuous", "mixed-integer", "scheduled", "scheduled-mixed-integer", "target")
+KINDS = ("continuous", "mixed-integer", "scheduled", "scheduled-mixed-integer", "ideal")
 
 
 class Process:
@@ -41,21 +39,20 @@ def tuned(structure, fields, **more):
 def controller_of(kind, model, structure, fields, **more):
     """A controller of a kind; the structure is for whole moves."""
     structure = structure if "integer" in kind else structure.relaxed()
+    if kind == "ideal":
+        more = {"ideal": [55.0, 0.0], "ideal_weight": [1.0, 0.0]} | more
     tuning = tuned(structure, fields, **more)
     if kind.startswith("scheduled"):
         corners = [(choke, lift) for choke in (0.0, 100.0) for lift in (0.0, 10000.0)]
         named = [dict(zip(model.mv_names, corner, strict=True)) for corner in corners]
         models = [dataclasses.replace(model, working_point=tuple(point.items())) for point in named]
         return ScheduledController(structure, tuning, make_schedule(models))
-    if kind == "target":
-        return TargetController(structure, tuning, model, {"choke": 1.0})
     return Controller(structure, tuning, model)
 
 
 def stepped(controller, state, cv, setpoint=SETPOINT, mv=None, manual=None):
     """One step of any kind of controller."""
-    target = (TARGET,) if isinstance(controller, TargetController) else ()
-    return controller.step(state, cv, setpoint, *target, mv=mv, manual=manual)
+    return controller.step(state, cv, setpoint, mv=mv, manual=manual)
 
 
 def closed(controller, process, samples, *, seen=lambda k, cv: cv, told=False, **options):

@@ -162,6 +162,13 @@ def _integer(case: dict) -> list[int]:
     return [m for m, name in enumerate(case["model"]["mv"]) if name in case["structure"]["integer_step"]]
 
 
+def ideal_values(case, rng):
+    """Of every MV, with an influence like that of the CVs; no twist, because other people's forms have no cost for them."""
+    unit = np.array([_unit(case, m) for m in range(len(case["mv_now"]))])
+    case["tuning"]["ideal"] = (case["mv_now"] + unit * rng.uniform(-4, 4, len(unit))).tolist()
+    case["tuning"]["ideal_weight"] = (10 ** rng.uniform(-1.5, 0.5, len(unit)) / unit**2).tolist()
+
+
 @twist
 def continuous_mvs_without_limits(case, rng):
     for m in range(len(case["mv_now"])):

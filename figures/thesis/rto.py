@@ -42,7 +42,7 @@ def draw(data: xr.Dataset) -> Figure:
     for ax, mv in ((lift, LIFT), (choke, CHOKE)):
         panels.compared(ax, data, mv, CURVES, seconds)
         target = data.target.sel(controller=TARGETED, mv=mv)
-        panels.dashed(ax, data, target, seconds, "input target", CURVES[TARGETED]["color"])
+        panels.dashed(ax, data, target, seconds, "ideal value", CURVES[TARGETED]["color"])
         panels.limits(ax, data.position.sel(mv=mv), data.target.sel(mv=mv))
     _shade(lift, ranges)
     lift.set_ylim(bottom=0.0)

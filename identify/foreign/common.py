@@ -279,7 +279,7 @@ def identifiers(names: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
 
 def foreign_names(model: StepResponseModel) -> dict[str, str]:
     """Names as the file of the model had them, by ours."""
-    known = dict(model.provenance).get("names", {})
+    known = dict(dict(model.provenance).get("names", ()))
     return {name: known.get(name, name) for name in (*model.cv_names, *model.mv_names, *model.dv_names)}
 
 

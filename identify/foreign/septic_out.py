@@ -107,13 +107,17 @@ def _blocks(source: Source) -> list[Block]:
 
 def _mv(source: Source, i: int, mv: Mv) -> Block:
     lengths = source.structure.blocks_of(i)
+    weight = source.of("ideal_weight", i)
+    ideal = (
+        {"IvOn": source.of("ideal", i), "Fulf": weight * source.scale(mv) ** 2} if weight else {"IvOff": 0}
+    )
     return _block(
         "Mvr",
         source.names[mv.name],
         **_described(mv, source.start(mv.name)),
         **_limits(source.of("mv_low", i), source.of("mv_high", i)),
         ProcessValue=source.start(mv.name),
-        IvOff=0,
+        **ideal,
         MaxUp=min(source.of("move_high", i), 1e10),
         MaxDn=max(source.of("move_low", i), -1e10),
         MovePnlty=source.of("move_weight", i) * source.scale(mv) ** 2,
@@ -243,6 +247,7 @@ def _tuning_rows(tuning: Tuning, preset: str, row: Any) -> None:
         "measurement_low": "MeasLowLimit",
         "measurement_high": "MeasHighLimit",
         "bad_limit": "BadCntLim",
+        "ideal": "IvOn",
     }
     approximated = {
         "cv_weight": "Fulf; how it enters there is not documented",
@@ -250,6 +255,7 @@ def _tuning_rows(tuning: Tuning, preset: str, row: Any) -> None:
         "move_weight": "MovePnlty; how it enters there is not documented",
         "slack_weight": "HighPnlty, LowPnlty: quadratic there",
         "bias_cutoff": "BiasTfilt = 1 / bias_cutoff",
+        "ideal_weight": "Fulf; how it enters there is not documented",
     }
     for key, field in FIELDS.items():
         values = np.asarray(getattr(tuning, key))

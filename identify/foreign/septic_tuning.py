@@ -64,6 +64,12 @@ def fill(
         },
         "slack_weight": {ours[b.name]: _slack(b, prediction) / scale[b.name] for b in own.cvs},
     }
+    ideal = {b.name: b.number("IvOn", "an ideal value", 0.0) for b in own.mvs if b.find("IvOn")}
+    if ideal:
+        preset["ideal"] = {ours[name]: value for name, value in ideal.items()}
+        preset["ideal_weight"] = {
+            ours[b.name]: _fulf(b, "ideal value") / scale[b.name] ** 2 for b in own.mvs if b.name in ideal
+        }
     _bands(preset, own, ours, report)
     _moves(preset, own, body, ours)
     _measurements(preset, own, ours, report)
@@ -143,12 +149,17 @@ def _penalty(block: Block, name: str, what: str) -> float:
 
 def _cv_weight(block: Block, report: Report) -> float:
     """`Fulf`, where there is a setpoint at the start."""
-    weight = _penalty(block, "Fulf", "penalty of setpoint deviations")
-    factor = _penalty(block, "FulfDynScale", "factor on Fulf in the dynamic problem")
     off = block.find("SetPntOn") is None
     if off and block.find("SetPntOff") is None:
         report.notes.append(f"{block.name} has no SetPntOn or SetPntOff: no setpoint, cv_weight 0")
-    return 0.0 if off else weight * factor
+    weight = _fulf(block, "setpoint")
+    return 0.0 if off else weight
+
+
+def _fulf(block: Block, of: str) -> float:
+    """`Fulf` of a setpoint or an ideal value, as it counts in the dynamic problem."""
+    factor = _penalty(block, "FulfDynScale", "factor on Fulf in the dynamic problem")
+    return _penalty(block, "Fulf", f"penalty of deviations from the {of}") * factor
 
 
 def _slack(block: Block, prediction: int) -> float:

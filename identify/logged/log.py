@@ -19,7 +19,7 @@ from jaxmpc.check import is_number
 from jaxmpc.errors import InputError
 
 GAP = 5.0  # typical intervals without a row from which on a new segment begins
-HOLD = 3  # samples over which a missing input is held
+HOLD = 3.0  # samples over which a missing input is held
 SPIKE = 8.0  # robust standard deviations of the change from row to row from which on a jump there and back is none
 SPIKE_SHARE = 0.1  # of the range of the column, which such a jump has at least
 FROZEN = 30  # rows with exactly the same value, of a signal that changes otherwise
@@ -64,6 +64,8 @@ def read_log(
     time: str | None = None,
     *,
     held: Collection[str] = (),
+    hold: float = HOLD,
+    clean: bool = True,
 ) -> Log:
     """Read a CSV or Parquet file and put it on a regular grid.
 
@@ -74,6 +76,8 @@ def read_log(
         time: column of the times; by default the first, or one called time, date or the like. Without any, rows are `dt`
             apart.
         held: those of the columns that are inputs.
+        hold: samples over which a missing input is held; after that, a new segment begins with its next value.
+        clean: whether outliers and frozen pieces of the other columns count as missing.
 
     Raises:
         InputError: naming column, row and value; also for fewer than 20 samples, or a column without any value.
@@ -95,7 +99,7 @@ def read_log(
     for name, values in table.columns.items():
         if not np.isfinite(values).any():
             raise InputError(f"column {name}", "no value in any row", "numbers")
-        if name not in held:
+        if clean and name not in held:
             table.columns[name] = _cleaned(name, values, notes)
     typical = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
     if dt is None:
@@ -105,7 +109,7 @@ def read_log(
         np.arange(len(stamps)), np.flatnonzero(np.diff(stamps) > GAP * max(typical, dt / GAP)) + 1
     )
     _tell_of_intervals(stamps, typical, dt, pieces, notes)
-    return _on_grid(table, pieces, typical, dt, held, notes)
+    return _on_grid(table, pieces, typical, dt, held, hold, notes)
 
 
 def _in_order(table: Table, notes: list[str]) -> Table:
@@ -186,7 +190,13 @@ def _tell_of_intervals(stamps: np.ndarray, typical: float, dt: float, pieces: li
 
 
 def _on_grid(
-    table: Table, pieces: list[np.ndarray], typical: float, dt: float, held: Collection[str], notes: list[str]
+    table: Table,
+    pieces: list[np.ndarray],
+    typical: float,
+    dt: float,
+    held: Collection[str],
+    hold: float,
+    notes: list[str],
 ) -> Log:
     stamps = table.stamps
     assert stamps is not None
@@ -202,7 +212,7 @@ def _on_grid(
         made, usable = {}, np.ones(len(grid), bool)
         for name, values in own.items():
             if name in held:
-                made[name], good = _held(stamps[rows], values, grid, slack, HOLD * max(dt, typical))
+                made[name], good = _held(stamps[rows], values, grid, slack, hold * max(dt, typical))
                 usable &= good
                 lost[name] += int((~good).sum())
                 changes = np.flatnonzero(np.diff(values) != 0) + 1
@@ -218,9 +228,8 @@ def _on_grid(
                     columns[name].append(made[name][part])
     for name, count in lost.items():
         if count:
-            notes.append(
-                f"{name}: {count} samples without a value within {HOLD} samples are left out, which parts the log"
-            )
+            where = f"within {hold:g} samples" if np.isfinite(hold) else "until then"
+            notes.append(f"{name}: {count} samples without a value {where} are left out, which parts the log")
         if moved_within[name]:
             notes.append(f"{name} moves between two samples {moved_within[name]} times; seen at the next one")
     count = sum(map(len, times))

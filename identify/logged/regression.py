@@ -81,7 +81,7 @@ def sums(
         known = np.isfinite(segment.output)
         if not known.any():
             continue
-        own, precision = _own_columns(len(known), length, free, slope)
+        own, precision = free_columns(len(known), length, free, slope=slope)
         square = np.zeros((own.shape[1] + width + 1,) * 2)
         for rows, logs in whitened(noise, _rows(segment, own, length), known):
             square += rows.T @ rows
@@ -103,7 +103,9 @@ def sums(
     )
 
 
-def _own_columns(samples: int, length: int, free: float | None, slope: bool):
+def free_columns(
+    samples: int, length: int, free: float | None, *, slope: bool = False
+) -> tuple[Float[np.ndarray, "sample column"], Float[np.ndarray, " column"]]:
     """Columns that one segment has for itself, and their precisions."""
     columns, precision = [np.ones((samples, 1))], [FLAT]
     if slope:

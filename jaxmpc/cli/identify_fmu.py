@@ -85,15 +85,20 @@ def written(found: Any, out: Path, page: Path, *more: Path) -> int:
     found = dataclasses.replace(found, advice=(*found.advice, f"Make a process of it: {following}"))
     write_page(found, page)  # the one that may be refused, for its size
     found.model.save(out)
-    wide = max(len(f"{row.input} on {row.cv}") for row in found.verdicts)
-    for row in found.verdicts:
-        print(f"{row.verdict:<6}{f'{row.input} on {row.cv}':<{wide}}  {row.says}")
-    for line in (*found.notes, *found.advice[:-1]):
-        print(f"note: {line}")
+    said(found, found.advice[:-1])
     for path in (out, page, *more):
         print(path)
     print(f"Next: {following}")
     return EXIT_OPTIMAL
+
+
+def said(found: Any, advice: Sequence[str] | None = None) -> None:
+    """Print the verdicts and notes of an identification, and what to do next."""
+    wide = max(len(f"{row.input} on {row.cv}") for row in found.verdicts)
+    for row in found.verdicts:
+        print(f"{row.verdict:<6}{f'{row.input} on {row.cv}':<{wide}}  {row.says}")
+    for line in (*found.notes, *(found.advice if advice is None else advice)):
+        print(f"note: {line}")
 
 
 def _named(name: str, given: Sequence[str]) -> list[tuple[str, str | None]]:

@@ -14,7 +14,19 @@ import io
 import os
 import sys
 
-from jaxmpc.cli import bench, explore, figures, fmu_controller, identify, model, plan, process, study
+from jaxmpc.cli import (
+    bench,
+    explore,
+    figures,
+    fmu_controller,
+    identify,
+    model,
+    plan,
+    process,
+    replay,
+    study,
+    update,
+)
 from jaxmpc.cli.options import EXIT_BAD_INPUT, EXIT_OTHER, EXIT_UNREAD, Command, complain, parser
 from jaxmpc.errors import InputError, MissingToolError, PlantError
 from jaxmpc.programs import interrupts
@@ -103,7 +115,19 @@ def _check_platform() -> None:
 
 COMMANDS = {
     command.words: command
-    for part in (plan, identify, fmu_controller, model, process, study, figures, explore, bench)
+    for part in (
+        plan,
+        identify,
+        fmu_controller,
+        model,
+        process,
+        study,
+        replay,
+        update,
+        figures,
+        explore,
+        bench,
+    )
     for command in vars(part).values()
     if isinstance(command, Command)
 }

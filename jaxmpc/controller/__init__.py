@@ -1,1 +1,1 @@
-"""Controllers: state, measurement, step, plan, targets (6.20)."""
+"""Controllers: state, measurement, step, plan."""

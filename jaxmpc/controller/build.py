@@ -18,6 +18,7 @@ from jaxmpc.errors import InputError
 from jaxmpc.integer.tables import INTEGERS, Constants, Tables
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.condense import CondensedQp, Matrices, condense, matrices_of
+from jaxmpc.problem.ideal import has_ideal
 from jaxmpc.problem.layout import Layout, Size, layout_of, rung
 from jaxmpc.problem.memory import check_size
 from jaxmpc.problem.structure import Structure, check_match
@@ -27,16 +28,16 @@ from jaxmpc.programs.lanes import Lanes, lanes_of
 AT_ONCE = 64  # lanes that are condensed together
 
 _matrices = jax.jit(matrices_of, static_argnames=("size", "summed"))
-_condense = jax.jit(condense, static_argnames=("size", "envelope", "has_limits"))
+_condense = jax.jit(condense, static_argnames=("size", "envelope", "has_limits", "has_ideal"))
 
 
-@functools.partial(jax.jit, static_argnames=("size", "envelope", "has_limits"))
-def _condense_some(layouts: Lanes[Layout], size, tunings, matrices: Lanes[Matrices], envelope, has_limits):
+@functools.partial(jax.jit, static_argnames=("size", "form"))
+def _condense_some(layouts: Lanes[Layout], size, tunings, matrices: Lanes[Matrices], form):
     """Problems of `AT_ONCE` lanes, without their responses."""
 
     def lane(layout, tuning, own):
         given = eqx.combine(own, matrices.shared)
-        return _bare(condense(layout, size, tuning, given, envelope=envelope, has_limits=has_limits))
+        return _bare(condense(layout, size, tuning, given, **dict(form)))
 
     return layouts.vmap(lane, tunings, matrices.each)
 
@@ -65,6 +66,7 @@ class Scenarios:
     size: Size  # that holds all structures
     integers: int  # whole moves that the tables of the search have room for
     has_limits: bool  # whether any CV limit costs anything
+    has_ideal: bool  # whether any MV has an ideal value
     switching: bool  # whether any CV may be switched off
 
     @classmethod
@@ -113,7 +115,8 @@ class Scenarios:
             own=_Own(*(len(values) > 1 for values in (structures, tunings, models))),
             size=functools.reduce(lambda a, b: a | b, (Size.of(*p, len(models[0].dv_names)) for p in pairs)),
             integers=min(rung(most, INTEGERS), INTEGERS[-1]) if most else 0,
-            has_limits=any(_limited(tuning) for tuning in tunings),
+            has_limits=any(map(_limited, tunings)),
+            has_ideal=any(map(has_ideal, tunings)),
             switching=any(may_switch(tuning) for tuning in tunings),
         )
 
@@ -145,7 +148,11 @@ class Scenarios:
     def problems(self, envelope: int) -> Lanes[CondensedQp]:
         """Constant parts of the problems, for integer moves of so many steps."""
         size = self.size
-        options = dict(envelope=envelope if self.integers else 0, has_limits=self.has_limits)
+        form: dict[str, Any] = dict(
+            envelope=envelope if self.integers else 0,
+            has_limits=self.has_limits,
+            has_ideal=self.has_ideal,
+        )
         made: dict[tuple[Structure, int], Matrices] = {}
         own = self.own.structure or self.own.model
         each = []
@@ -156,7 +163,7 @@ class Scenarios:
                 made[key] = _matrices(layout_of(structure, size), size, coefficients, summed=not own)
             each.append(made[key])
         if not self.lanes:
-            qp = _condense(layout_of(self.structure, size), size, self.tunings[0], each[0], **options)
+            qp = _condense(layout_of(self.structure, size), size, self.tunings[0], each[0], **form)
             return lanes_of([qp])
         matrices = lanes_of(each, shared=not own)
         # on the host, where another number of them needs no program of its own
@@ -166,7 +173,7 @@ class Scenarios:
             index = np.minimum(begin + np.arange(AT_ONCE), self.count - 1)
             some = jax.tree.map(lambda v, i=index: np.asarray(v)[i], (layouts.each, tunings, matrices.each))
             some_layouts, some_matrices = Lanes(some[0], layouts.shared), Lanes(some[2], matrices.shared)
-            qps = _condense_some(some_layouts, size, some[1], some_matrices, **options)
+            qps = _condense_some(some_layouts, size, some[1], some_matrices, tuple(form.items()))
             used = min(AT_ONCE, self.count - begin)
             found.append(jax.tree.map(lambda v, u=used: np.asarray(v)[:u], qps))
         joined = jax.tree.map(lambda *v: np.concatenate(v), *found)
@@ -215,6 +222,7 @@ class Scenarios:
             self,
             own=self.own._replace(tuning=self.own.tuning or own),
             has_limits=self.has_limits or any(map(_limited, tunings)),
+            has_ideal=self.has_ideal or any(map(has_ideal, tunings)),
             switching=self.switching or any(map(may_switch, tunings)),
         )
 

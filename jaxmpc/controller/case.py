@@ -81,6 +81,8 @@ _TuningFields: Any = msgspec.defstruct(
     [
         (key, dict[str, Any], {})
         if field.flag
+        else (key, list[float] | None, None)
+        if field.optional
         else (key, list[float | None] if field.infinite else list[float])
         for key, field in _IN_STEP.items()
     ],
@@ -172,7 +174,7 @@ def make_case(body: Any) -> Case:
     case = Case(
         model=model,
         structure=structure,
-        tuning=make_tuning(structure, **{key: getattr(fields.tuning, key) for key in _IN_STEP}),
+        tuning=make_tuning(structure, **_given(fields.tuning)),
         **{key: step_array(key, getattr(fields, key), structure) for key in _ARRAYS},
         samples_since_move=checked_since(structure, fields.samples_since_move),
         time_limit=check_time_limit("limits.time_s", limits.time_s),
@@ -191,6 +193,7 @@ def case_to_dict(case: Case) -> dict[str, Any]:
     structure, model = case.structure, case.model
     rare = {key: _by_name(structure, getattr(structure, key)) for key in _RARE}
     tuning = {key: np.asarray(getattr(case.tuning, key)).tolist() for key in _IN_STEP}
+    tuning = {key: v for key, v in tuning.items() if not TUNING[key].optional or np.any(v)}
     for key, field in _IN_STEP.items():
         if field.flag:
             tuning[key] = {structure.mv_names[i]: tuning[key][i] for i in structure.integer_mvs}
@@ -214,6 +217,12 @@ def case_to_dict(case: Case) -> dict[str, Any]:
     if case.samples_since_move is not None:
         body["samples_since_move"] = list(case.samples_since_move)
     return body
+
+
+def _given(fields: Any) -> dict[str, Any]:
+    """The fields of a tuning, without those that may be left out and are."""
+    values = {key: getattr(fields, key) for key in _IN_STEP}
+    return {key: value for key, value in values.items() if value is not None}
 
 
 def _by_name(structure: Structure, values: tuple) -> dict[str, Any]:

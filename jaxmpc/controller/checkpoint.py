@@ -19,16 +19,13 @@ from jaxmpc.check import check_keys
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.core import ControllerState
 from jaxmpc.controller.schedule import ModelSchedule, ScheduledController
-from jaxmpc.controller.targets import TargetController
 from jaxmpc.errors import InputError
 from jaxmpc.files import from_strict_json, read_json, strict_json, write_atomically
-from jaxmpc.model.step_response import StepResponseModel, make_model
+from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure
-from jaxmpc.problem.tuning import CV_FIELDS, Tuning, make_tuning
+from jaxmpc.problem.tuning import Tuning, make_tuning
 
 FORMAT = "jaxmpc/controller/2"
-
-AnyController = Controller | TargetController
 
 
 class _Parts(NamedTuple):
@@ -41,9 +38,7 @@ class _Parts(NamedTuple):
     options: dict[str, Any]
 
 
-def save_controller(
-    controller: AnyController, path: str | Path, state: ControllerState | None = None
-) -> Path:
+def save_controller(controller: Controller, path: str | Path, state: ControllerState | None = None) -> Path:
     """Write a controller, and the state that it is in, as one file.
 
     Args:
@@ -67,7 +62,7 @@ def save_controller(
     return write_atomically(path, json.dumps(body, allow_nan=False))
 
 
-def load_controller(path: str | Path) -> tuple[AnyController, ControllerState | None]:
+def load_controller(path: str | Path) -> tuple[Controller, ControllerState | None]:
     """Read what `save_controller` wrote.
 
     Returns:
@@ -91,19 +86,7 @@ def load_controller(path: str | Path) -> tuple[AnyController, ControllerState | 
         raise InputError("controller file", str(path), f"what save_controller writes ({error})") from error
 
 
-def _parts(controller: AnyController) -> _Parts:
-    if isinstance(controller, TargetController):
-        inner = _parts(controller.controller)
-        cvs = controller.structure.cv_count
-        weights = np.asarray(inner.tuning.cv_weight)[cvs:].tolist()
-        names = [controller.structure.mv_names[i] for i in controller.targeted]
-        own = {key: getattr(inner.tuning, key)[:cvs] for key in CV_FIELDS}
-        assert isinstance(inner.model, StepResponseModel)
-        model = _model(controller.structure, inner.model)
-        options = {"target_weight": dict(zip(names, weights, strict=True)), **inner.options}
-        return _Parts(
-            "target", controller.structure, dataclasses.replace(inner.tuning, **own), model, options
-        )
+def _parts(controller: Controller) -> _Parts:
     options = {key: getattr(controller, key) for key in ("gap", "time_limit", "finish")}
     structure, tuning = controller.structure, controller.tuning
     if isinstance(controller, ScheduledController):
@@ -112,20 +95,10 @@ def _parts(controller: AnyController) -> _Parts:
     return _Parts("controller", structure, tuning, controller.model, options)
 
 
-def _model(structure: Structure, wide: StepResponseModel) -> StepResponseModel:
-    """The model of a structure's CVs, without those of the targets."""
-    s, cvs = structure, structure.cv_count
-    names: dict[str, Any] = dict(
-        cv_units=s.cv_units, mv_units=s.mv_units, dv_names=wide.dv_names, dv_units=wide.dv_units
-    )
-    coefficients, of_dvs = wide.coefficients[:cvs], wide.dv_coefficients[:cvs]
-    return make_model(coefficients, s.dt, s.cv_names, s.mv_names, dv_coefficients=of_dvs, **names)
+KINDS = {"controller": Controller, "scheduled": ScheduledController}
 
 
-KINDS = {"controller": Controller, "scheduled": ScheduledController, "target": TargetController}
-
-
-def _made(body: dict[str, Any]) -> AnyController:
+def _made(body: dict[str, Any]) -> Controller:
     if body["kind"] not in KINDS:
         raise InputError("controller.kind", body["kind"], f"one of {', '.join(KINDS)}")
     tuples: dict[str, Any] = {
@@ -139,7 +112,7 @@ def _made(body: dict[str, Any]) -> AnyController:
     return KINDS[body["kind"]](structure, tuning, model, **body["options"])  # pyright: ignore[reportArgumentType]
 
 
-def _restored(controller: AnyController, saved: Any) -> ControllerState:
+def _restored(controller: Controller, saved: Any) -> ControllerState:
     """The state with these numbers, in the form that the controller makes it."""
     if not isinstance(saved, dict):
         raise InputError("controller.state", type(saved).__name__, "an object with the fields of the state")

@@ -416,7 +416,7 @@ class Controller:
     def with_tuning(self, tuning: Tuning) -> Self:
         """This controller with another tuning, for the states of this one.
 
-        It shares the compiled programs, unless the tuning is the first with a CV limit or a `bad_limit`.
+        It shares the compiled programs, unless the tuning is the first with a CV limit, an ideal value or a `bad_limit`.
         """
         other = copy.copy(self)
         other.tuning, other.lanes = tuning, self.lanes.of(self.lanes.scenarios.with_tunings([tuning]))

@@ -257,6 +257,7 @@ class Core(eqx.Module):
             mv_now=state.mv,
             last_move=state.last_move,
             past_moves=state.past_moves,
+            position=state.position,
             recover=True,
         )
 
@@ -277,7 +278,11 @@ class Core(eqx.Module):
 
     def condensed(self, tuning: Tuning, matrices: Matrices) -> CondensedQp:
         """The constant part of another tuning or model, in the form of this one's."""
-        form: dict[str, Any] = dict(envelope=self.qp.steep.shape[0], has_limits=self.qp.has_limits)
+        form: dict[str, Any] = dict(
+            envelope=self.qp.steep.shape[0],
+            has_limits=self.qp.has_limits,
+            has_ideal=self.qp.ideal is not None,
+        )
         return condense(self.layout, self.size, tuning, matrices, **form)
 
     def consider(self, state: ControllerState, sample: Sample, gap, search=True, most=np.inf) -> Moment:
@@ -295,7 +300,8 @@ class Core(eqx.Module):
             free_response += advance_free_response(
                 jnp.zeros_like(state.future), self.coefficients, correction
             ).T
-            standing = eqx.tree_at(lambda s: s.mv, state, state.mv + correction)
+            corrected = state.mv + correction, state.position + correction
+            standing = eqx.tree_at(lambda s: (s.mv, s.position), state, corrected)
         instance = self.instance(standing, qp, tuning, free_response, sample.setpoint)
         tables = eqx.tree_at(lambda t: t.known, tables, tables.known & search)
         decision = decide(qp, tables, instance, state.warm, gap, most)

@@ -274,7 +274,8 @@ class Planner:
         x = np.where(np.asarray(core.qp.whole), np.round(x), x)
         x = held_within(self.structure, size, instance, x)  # solver tolerance is taken out
         moves = (x * np.asarray(core.qp.scale)).reshape(size.mvs, -1).T[: self.structure.block_count]
-        objective, cv, eps = self.objective(moves, free_response, setpoint)
+        mv = mv_now + np.cumsum(moves_of_samples(self.structure, moves), axis=0)
+        objective, cv, eps = self.objective(moves, mv, free_response, setpoint)
         bound = min(result.bound, objective)
         state, reason = result.status, result.reason
         if state == codes.OPTIMAL and not closes(objective, bound, self._unit, gap):
@@ -285,7 +286,7 @@ class Planner:
             bound=bound,
             gap=float(relative_gap(objective, bound, self._unit)),
             moves=moves,
-            mv=mv_now + np.cumsum(moves_of_samples(self.structure, moves), axis=0),
+            mv=mv,
             cv=cv,
             eps_high=eps[0],
             eps_low=eps[1],
@@ -298,9 +299,13 @@ class Planner:
         )
 
     def objective(
-        self, moves, free_response, setpoint
+        self, moves, mv, free_response, setpoint
     ) -> tuple[float, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """(6.6) of a plan ``"block mv"`` in engineering units, with its predictions and limit violations.
+        """(6.6) and (6.20) of a plan in engineering units, with its predictions and limit violations.
+
+        Args:
+            moves: ``"block mv"``.
+            mv: the MVs that follow, ``"sample mv"``.
 
         Returns:
             ``(objective, cv, (eps_high, eps_low))``.
@@ -313,11 +318,13 @@ class Planner:
         eps_high = np.maximum((y - tuning.cv_high).max(axis=0), 0.0)
         eps_low = np.maximum((tuning.cv_low - y).max(axis=0), 0.0)
         counts = counts_by_mv(self.structure)
+        held = np.minimum(np.arange(first, len(cv)), len(mv) - 1)
         value = (
             (tuning.cv_weight * deviation**2).sum()
             + (tuning.move_weight * counts * moves**2).sum()
             + (tuning.soft_quadratic * beyond**2 + tuning.soft_linear * beyond).sum()
             + (tuning.slack_weight * (eps_high + eps_low)).sum()
+            + (tuning.ideal_weight * (mv[held] - tuning.ideal) ** 2).sum()
         )
         return float(value), cv, (eps_high, eps_low)
 

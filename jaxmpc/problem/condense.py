@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxmpc.problem.gram import running_sums
+from jaxmpc.problem.ideal import IdealCost
 from jaxmpc.problem.layout import Layout, Size
 from jaxmpc.problem.tuning import Tuning
 
@@ -126,6 +127,7 @@ class CondensedQp(eqx.Module):
     whole: Bool[Array, " n"]  # moves that are whole
     # curvature of the positions that is paid along the chords of their square and not in `hessian` (`integer.tighten`)
     position_weight: Float[Array, " hard"] | None
+    ideal: IdealCost | None  # of the MVs' distances from their ideal values; None where no MV has one
     # whether any CV limit is finite (static; without, their rows are left out)
     has_limits: bool = eqx.field(static=True)
 
@@ -232,6 +234,7 @@ def condense(
     *,
     envelope: int = 1,
     has_limits: bool = True,
+    has_ideal: bool = True,
 ) -> CondensedQp:
     """Build the constant part of the condensed problem (5.8)-(5.13), (6.6).
 
@@ -239,14 +242,18 @@ def condense(
         envelope: largest whole number of steps an integer move can make, for the envelope of its weight; 0 keeps the
             plain square.
         has_limits: whether any CV limit is finite (static; False drops their rows from the solver).
+        has_ideal: whether any MV has an ideal value (static).
     """
     n, raw = size.moves, matrices.response
-    _, inside = penalised(layout, size)
+    j, inside = penalised(layout, size)
     per_cv = lambda values: (values[:, None] * inside).reshape(-1)  # noqa: E731
     spread = lambda values: jnp.repeat(values, size.blocks)  # noqa: E731
     counts = jnp.broadcast_to(layout.count, (size.mvs, size.blocks)).reshape(-1)
     weight = counts * spread(tuning.move_weight)  # paid at every sample of the block
     tracking = 2.0 * jnp.einsum("c,cik->ik", tuning.cv_weight, matrices.squared)
+    ideal = IdealCost.of(layout, size, tuning, j, inside) if has_ideal else None
+    if ideal is not None:
+        tracking += ideal.curvature()
     soft = tuning.soft_quadratic @ jnp.diagonal(matrices.squared, axis1=1, axis2=2)
     scale = _variable_scale(layout, size, tuning, jnp.diagonal(tracking) + 2.0 * (weight + soft))
     weight = weight * scale**2
@@ -275,6 +282,7 @@ def condense(
         reach=jnp.max(matrices.largest * scale, axis=1),
         whole=whole,
         position_weight=None,
+        ideal=None if ideal is None else ideal.scaled(scale),
         has_limits=has_limits,
     )
 

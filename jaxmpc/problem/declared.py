@@ -35,6 +35,7 @@ class Declared:
     choices: tuple[str, ...] = ()  # the texts that are accepted, where it is one
     # whether a single step needs it; the rest is about what a controller remembers between steps
     in_step: bool = True
+    optional: bool = False  # whether a case file has it only where it is not the default
 
     @property
     def text(self) -> str:
@@ -91,8 +92,8 @@ class Declared:
         wrong = ""
         if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value:
             wrong = "a number"
-        elif not self.infinite and (value < 0 or math.isinf(value)):
-            wrong = "a finite number, 0 or more"
+        elif not self.infinite and (value < self.least or math.isinf(value)):
+            wrong = "a finite number" + (f", {self.least:g} or more" if self.least > -math.inf else "")
         elif value < self.least:
             wrong = f"{self.least:g} or more"
         elif LARGEST < abs(value) < math.inf:

@@ -25,6 +25,8 @@ class QpInstance(eqx.Module):
     upper: Float[Array, " n"]
     row_low: Float[Array, " hard"]  # limits of the hard rows
     row_high: Float[Array, " hard"]
+    # where the MVs stand above their ideal values; None where none has one [MV unit]
+    distance: Float[Array, " mv"] | None = None
 
 
 def make_instance(
@@ -38,6 +40,7 @@ def make_instance(
     mv_now: Float[Array, " mv"],
     last_move: Float[Array, " mv"],
     past_moves: Float[Array, "past mv"],
+    position: Float[Array, " mv"] | None = None,
     recover: bool | Bool[Array, ""] = False,
 ) -> QpInstance:
     """The problem of one sample.
@@ -48,6 +51,7 @@ def make_instance(
         mv_now: MVs before the move [MV unit].
         last_move: the previous move [MV unit]; enters the oscillation rows rounded to whole steps (thesis 6.5).
         past_moves: the last moves, oldest first, for the mean-move limit (6.6) [MV unit].
+        position: where the actuators stand in the predictions, at `mv_now` if not given [MV unit].
         recover: let an MV outside its limits return as fast as its move limits allow, in place of being infeasible.
     """
     j, inside = penalised(layout, size)
@@ -65,6 +69,7 @@ def make_instance(
         upper=box[1].reshape(-1),
         row_low=rows[0],
         row_high=rows[1],
+        distance=None if qp.ideal is None else (mv_now if position is None else position) - tuning.ideal,
     )
 
 

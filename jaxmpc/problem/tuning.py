@@ -62,6 +62,23 @@ class Tuning(eqx.Module):
     move_high: Float[Array, " mv"] = _mv_limit(
         "MV unit per sample", "largest move up of {}", "hard", "(5.1d)"
     )
+    ideal: Float[Array, " mv"] = _mv(
+        "MV unit",
+        "ideal value of {}",
+        "where it rests as far as the CVs leave it free; without meaning while its weight is 0",
+        "u_RTO (6.20)",
+        default=0.0,
+        least=-np.inf,
+        optional=True,
+    )
+    ideal_weight: Float[Array, " mv"] = _mv(
+        "1/MV unit^2",
+        "weight of the distance of {} from its ideal value",
+        "squared, at every penalised sample",
+        "(6.20)",
+        default=0.0,
+        optional=True,
+    )
     oscillation_rows: Bool[Array, " mv"] = _mv(
         "", "no reversal from one sample to the next", "of integer MVs", "(6.16)", default=False, flag=True
     )
@@ -112,11 +129,7 @@ class Tuning(eqx.Module):
 
 
 FIELDS = MappingProxyType(declared(Tuning))
-CV_FIELDS = tuple(key for key, field in FIELDS.items() if field.of == "cv")
 LIMIT_PAIRS = tuple((key, field.high) for key, field in FIELDS.items() if field.high)
-DEFAULTS = MappingProxyType(
-    {key: field.default for key, field in FIELDS.items() if field.default is not None}
-)
 
 
 def make_tuning(structure: Structure, *, path: str = "tuning", **fields) -> Tuning:

@@ -43,6 +43,7 @@ class VariableSection(Section, frozen=True):
     unit: str = "1"
     label: str = ""  # the name in words, if not given
     span: Positive = 1.0
+    tag: str = ""  # the name, if not given
 
 
 class CvSection(VariableSection, frozen=True):
@@ -51,6 +52,7 @@ class CvSection(VariableSection, frozen=True):
     low: float = -np.inf
     high: float = np.inf
     settled: float = 0.0  # a fiftieth of the span, if not given
+    setpoint_tag: str = ""
 
 
 class ActuatorSection(Section, frozen=True):
@@ -175,7 +177,7 @@ def process_of(body: Any, folder: str | Path = ".", *, files: bool = True) -> Pr
         dt=file.dt,
         cvs=cvs,
         mvs=mvs,
-        disturbances=tuple(Variable(s.name, s.unit, _label(s), s.span) for s in file.disturbance),
+        disturbances=tuple(Variable(s.name, s.unit, _label(s), s.span, s.tag) for s in file.disturbance),
         plants={name: PlantSource(s.kind, s.source, dict(s.options)) for name, s in file.plants.items()},
         model=_model(file),
         structure_fields=_structure_fields(file.structure),
@@ -330,7 +332,17 @@ def _cv(path: str, section: CvSection) -> Cv:
         settled,
         f"a half width above 0 [{section.unit}]",
     )
-    return Cv(section.name, section.unit, _label(section), section.span, section.low, section.high, settled)
+    return Cv(
+        section.name,
+        section.unit,
+        _label(section),
+        section.span,
+        section.tag,
+        section.low,
+        section.high,
+        settled,
+        section.setpoint_tag,
+    )
 
 
 def _mv(path: str, section: MvSection) -> Mv:
@@ -343,6 +355,7 @@ def _mv(path: str, section: MvSection) -> Mv:
         section.unit,
         _label(section),
         section.span,
+        section.tag,
         _actuator(f"{path}.actuator", section),
         section.low,
         section.high,

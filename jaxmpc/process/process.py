@@ -38,6 +38,12 @@ class Variable:
     unit: str
     label: str  # in words, without the unit
     span: float = 1.0  # how far it typically moves, in its unit
+    tag: str = ""  # what logs of the plant call it; its name, if not given
+
+    @property
+    def column(self) -> str:
+        """Of a log."""
+        return self.tag or self.name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +53,7 @@ class Cv(Variable):
     low: float = -np.inf  # soft limits, for presets that do not give their own [CV unit]
     high: float = np.inf
     settled: float = 0.0  # half width around the setpoint in which it counts as settled [CV unit]
+    setpoint_tag: str = ""  # what logs call its setpoint, if they have it
 
 
 @dataclasses.dataclass(frozen=True)

@@ -202,6 +202,8 @@ def prepare(
     """
     offset, size = instance.offset, jnp.abs(qp.response)
     linear = 2.0 * ((qp.quadratic * offset) @ qp.response) * qp.scale
+    if qp.ideal is not None and instance.distance is not None:
+        linear += qp.ideal.linear(instance.distance)
     beyond = jnp.maximum(jnp.abs(offset) - qp.deadzone, 0.0)
     steep = jnp.abs(linear) + ((qp.soft_linear + 2.0 * qp.soft_quadratic * beyond) @ size) * qp.scale
     steep += jnp.sum(qp.steep, axis=0)
@@ -263,6 +265,8 @@ def _value(qp: CondensedQp, instance: QpInstance, x, t) -> Float[Array, ""]:
     if qp.position_weight is not None:
         w = qp.rows.of(x)
         own += qp.position_weight @ (chords(w) - w**2)
+    if qp.ideal is not None and instance.distance is not None:
+        own += qp.ideal.value(x, instance.distance)
     return total(qp.quadratic * t**2 + _soft_cost(qp, t)) + own + jnp.sum(limit_cost(qp, instance, t))
 
 

@@ -3,7 +3,7 @@
 The steady CVs are a function of two MVs (6.19b), given on a grid and linear over the triangles between its points.
 `optimise` finds the most profitable point (6.19a) of that function inside limits of the CVs and outside forbidden bands of
 the MVs, or the point closest to CVs that were demanded, as an exact mixed-integer linear programme. Its `Targets` are
-setpoints for the CVs and, by `jaxmpc.controller.targets`, for the MVs of a controller.
+setpoints for the CVs and ideal values for the MVs of a controller.
 """
 
 from __future__ import annotations

@@ -133,6 +133,12 @@ def lifted(case: dict) -> Form:
         require(
             not given, f"structure.{key}", given, "none for other solvers, whose forms have no rows for it"
         )
+    require(
+        not n.W.any(),
+        "tuning.ideal_weight",
+        n.W.tolist(),
+        "none for other solvers, whose forms have no cost for it",
+    )
     units = move_units(n)
     size = cv_units(n, units)
     counts = np.ones(len(n.blocks)) if n.blocking == "inputs" else np.array(n.blocks, dtype=float)

@@ -15,6 +15,7 @@ import numpy as np
 WEIGHTS = dict(
     Q="cv_weight", P="move_weight", S2="soft_quadratic", S1="soft_linear", c="deadzone", rho="slack_weight"
 )
+OPTIONAL = dict(ideal="ideal", W="ideal_weight")  # what a case may leave out
 LIMITS = dict(ylo="cv_low", yhi="cv_high", ulo="mv_low", uhi="mv_high", dlo="move_low", dhi="move_high")
 STEP_ROUNDING = 1e-6  # [steps]: a limit so close to a whole number of steps counts as that number
 
@@ -56,6 +57,8 @@ def read(case: dict) -> SimpleNamespace:
     for name, key in LIMITS.items():
         missing = -np.inf if key.endswith("low") else np.inf
         setattr(n, name, np.array([missing if v is None else v for v in tuning[key]], dtype=float))
+    for name, key in OPTIONAL.items():
+        setattr(n, name, np.array(tuning.get(key, [0.0] * n.mvs), dtype=float))
     n.u0, n.last = np.array(case["mv_now"], dtype=float), np.array(case["last_move"], dtype=float)
     n.free, n.r = np.array(case["free_response"], dtype=float), np.array(case["setpoint"], dtype=float)
     n.first_low = np.array(case.get("first_move_low", [-np.inf] * n.mvs), dtype=float)
@@ -83,15 +86,17 @@ def predict(case: dict, moves) -> np.ndarray:
 
 
 def objective(case: dict, moves) -> float:
-    """The cost (6.6) of a plan, constants included, with the slacks at their smallest values."""
+    """The cost (6.6) and (6.20) of a plan, constants included, with the slacks at their smallest values."""
     n, y = read(case), predict(case, moves)
     e = (y - n.r)[n.hw - 1 :]
     eta = np.maximum(0.0, np.abs(e) - n.c)
     above = np.maximum(0.0, (y - n.yhi)[n.hw - 1 :].max(axis=0))
     below = np.maximum(0.0, (n.ylo - y)[n.hw - 1 :].max(axis=0))
     du = sample_moves(case, moves)
+    u = (n.u0 + np.cumsum(du, axis=0))[np.minimum(np.arange(n.hw - 1, n.hp), n.hu - 1)]  # held after Hu
     return float(
         (n.Q * e**2).sum()
+        + (n.W * (u - n.ideal) ** 2).sum()
         + (n.P * du**2).sum()
         + (n.S2 * eta**2 + n.S1 * eta).sum()
         + (n.rho * (above + below)).sum()

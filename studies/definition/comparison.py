@@ -61,6 +61,7 @@ class ControllerDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
         mean_move_mode: ``reactive`` or ``predictive``; see `jaxmpc.problem.structure.Structure`.
         schedule: whether the model follows the MVs, see `jaxmpc.controller.schedule`.
         position_feedback: whether it is told where the actuators stand, and predicts from there.
+        model: file of its step-response model, relative to the process file; that of the process if not given.
     """
 
     name: str
@@ -76,6 +77,7 @@ class ControllerDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     mean_move_mode: Literal["reactive", "predictive"] = "reactive"
     schedule: bool = False
     position_feedback: bool = False
+    model: str = ""
 
     def structure(self, process: Process) -> Structure:
         """The checked structure."""
@@ -130,6 +132,7 @@ class ControllerDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
             InputError: naming the field, by its path in the controller.
         """
         expected = f"continuous: no MV of {process.name} moves in steps or among values"
+        require(not (self.model and self.schedule), "model", self.model, "nothing: it has a gain schedule")
         require(self.kind == "continuous" or process.stepped, "kind", self.kind, expected)
         self.build_tuning(process)
         self.later_tunings(process)

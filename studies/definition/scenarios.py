@@ -90,6 +90,7 @@ class Group:
     Attributes:
         kind, actuator, structure, samples: what all of them have.
         has_limits: whether they have a finite CV limit.
+        has_ideal: whether an MV has an ideal value.
         switching: whether bad measurements may switch a CV off.
         preview: whether the controllers are told future setpoints and measured disturbances.
         points: distinct working points of their models.
@@ -101,6 +102,7 @@ class Group:
     structure: Structure
     samples: int
     has_limits: bool
+    has_ideal: bool
     switching: bool
     preview: bool
     points: tuple[models.Point, ...]
@@ -111,7 +113,8 @@ class Group:
     def program(self) -> tuple[Any, ...]:
         """What it is compiled for, besides the number of lanes."""
         size, whole = Size.of(self.structure, self.model_samples), bool(self.structure.integer_mvs)
-        return size, whole, self.actuator, self.has_limits, self.switching, len(self.points) == 1
+        form = self.has_limits, self.has_ideal, self.switching
+        return size, whole, self.actuator, *form, len(self.points) == 1
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -374,12 +377,13 @@ def _columns(table: AxisTable) -> tuple[Column, ...]:
 def _groups(inputs: Inputs, count: int, samples: int) -> tuple[Group, ...]:
     tuning = inputs.tuning
     limited = np.any(np.isfinite(tuning["cv_low"]) | np.isfinite(tuning["cv_high"]), axis=1)
+    ideal = np.any(tuning["ideal_weight"] > 0.0, axis=1)
     switching = np.any(np.isfinite(tuning["bad_limit"]), axis=1)
-    members: dict[tuple[Any, Any, Any, int, bool, bool, bool], list[int]] = {}
+    members: dict[tuple[Any, Any, Any, int, bool, bool, bool, bool], list[int]] = {}
     for k in range(count):
         variant = inputs.variants[inputs.variant[k]]
         same = variant.kind, variant.actuator, variant.structure, variant.samples
-        facts: Any = tuple(bool(row(values, k)) for values in (limited, switching, inputs.preview))
+        facts: Any = tuple(bool(row(values, k)) for values in (limited, ideal, switching, inputs.preview))
         members.setdefault((*same, *facts), []).append(k)
     groups = []
     for key, scenarios in members.items():

@@ -6,6 +6,7 @@ import functools
 
 import jax
 import numpy as np
+import pandas as pd
 import xarray as xr
 from jaxtyping import Array
 
@@ -66,6 +67,8 @@ def key_figures(data: xr.Dataset) -> xr.Dataset:
         tuned = Tuned(*(run[f"tuning_{name}"].values for name in Tuned._fields))
         span = run.mean_move_window.item()
         fields = {name: run[STORED.get(name, name)].values for name in RECORD}
+        # what a replayed log does not have stays as it was measured last
+        fields["cv"] = pd.DataFrame(fields["cv"]).ffill().bfill().to_numpy()
         arrays = run_of(fields, run.setpoint.values, window)
         row = _figures(
             arrays,

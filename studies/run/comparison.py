@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
-from identify.plants import closing, disturbance_of, fitting
+from identify.plants import closing, disturbance_of, fitting, load_model
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.schedule import ModelSchedule, ScheduledController
 from jaxmpc.errors import InputError
@@ -82,17 +82,18 @@ def run_comparison(
     scheduled: dict[str, Any] = {}
     if schedule is not None:
         scheduled["schedule"] = [np.asarray(part) for part in (*schedule.grid, schedule.coefficients)]
-    hashes = [
-        content_hash(inputs | (scheduled if controller.schedule else {}), controller.resolved(process))
-        for controller in definition.controllers
-    ]
+    models = [load_model(process, one.model) if one.model else model for one in definition.controllers]
+    hashes = []
+    for controller, own in zip(definition.controllers, models, strict=True):
+        known = inputs | {"model": np.asarray(own.coefficients)} | (scheduled if controller.schedule else {})
+        hashes.append(content_hash(known, controller.resolved(process)))
     study_hash = content_hash(FORMAT, msgspec.to_builtins(definition), hashes)
     layout = comparison_layout(definition, process, model, extra, hashes, study_hash, plant_facts, code)
 
     def run(i: int) -> Trajectory:
         controller = definition.controllers[i]
         given = {"schedule": schedule} if controller.schedule else {}
-        return run_controller(controller, definition, process, model, make_plant, progress, **given)
+        return run_controller(controller, definition, process, models[i], make_plant, progress, **given)
 
     return run_missing(folder, layout, run, say, others)
 
@@ -199,7 +200,7 @@ def results_layout(
     controllers: Mapping[str, str],
     hashes: Sequence[str],
     structure: Structure,
-    samples: int,
+    times: np.ndarray,
     blocks: int,
     shared: Callable[[], Mapping[str, xr.DataArray]],
     provenance: dict[str, Any],
@@ -209,6 +210,7 @@ def results_layout(
 
     Args:
         controllers: name and label of each.
+        times: of the samples [s].
         blocks: of the controller that has most.
         shared: gives the variables without a trajectory: setpoints, tuning, model, sweep.
         provenance: JSON-like facts, one attribute each, with ``study`` and ``title``.
@@ -226,7 +228,7 @@ def results_layout(
         ),
         variables=RUN_VARIABLES,
         coords=process_axes(
-            s.dt * np.arange(samples),
+            times,
             {"cv": s.cv_names, "mv": s.mv_names},
             {"cv": s.cv_units, "mv": s.mv_units},
         ),
@@ -257,9 +259,19 @@ def comparison_layout(
         controllers={controller.name: controller.label for controller in definition.controllers},
         hashes=hashes,
         structure=first,
-        samples=reference.samples(first.dt),
+        times=first.dt * np.arange(reference.samples(first.dt)),
         blocks=max(structure.block_count for structure in structures),
-        shared=lambda: {**_shared(definition, process, model), **extra()},
+        shared=lambda: {
+            **shared_variables(
+                process,
+                model,
+                definition.controllers,
+                reference.sample(first.dt),
+                reference.window(first.dt),
+                definition.offsets(process),
+            ),
+            **extra(),
+        },
         provenance={
             "study": definition.name,
             "title": definition.title,
@@ -280,19 +292,28 @@ def labelled(values: Any, dims: Sequence[str], long_name: str, unit: str, **axes
     return xr.DataArray(values, coords, dims, attrs={"long_name": long_name, "units": unit})
 
 
-def _shared(
-    definition: ComparisonDefinition, process: Process, model: StepResponseModel
+def shared_variables(
+    process: Process,
+    model: StepResponseModel,
+    controllers: Sequence[ControllerDefinition],
+    setpoint: np.ndarray,
+    window: np.ndarray,
+    disturbance: np.ndarray,
 ) -> dict[str, xr.DataArray]:
-    """Setpoints, disturbance, model and the controllers' tuning."""
-    reference, dt = definition.reference.build(process), model.dt
-    window = reference.window(dt).astype("i4")
-    lag = dt * np.arange(1, model.samples + 1), "time after the step", "s"
+    """Setpoints, disturbance, model and the controllers' tuning.
+
+    Args:
+        setpoint: ``"sample cv"`` [CV unit].
+        window: ``"sample"``, index of the setpoint window.
+        disturbance: ``"sample disturbance"``.
+    """
+    lag = model.dt * np.arange(1, model.samples + 1), "time after the step", "s"
     coefficients = np.asarray(model.coefficients)
     return {
-        "setpoint": labelled(reference.sample(dt), ("time", "cv"), "setpoint", "cv_unit"),
-        "window": labelled(window, ("time",), "index of the setpoint window", "1"),
+        "setpoint": labelled(setpoint, ("time", "cv"), "setpoint", "cv_unit"),
+        "window": labelled(window.astype("i4"), ("time",), "index of the setpoint window", "1"),
         "disturbance": labelled(
-            definition.offsets(process),
+            disturbance,
             ("time", "disturbance_name"),
             "disturbances",
             "unit of the disturbance",
@@ -301,14 +322,16 @@ def _shared(
         "model_coefficient": labelled(
             coefficients, ("cv", "mv", "lag"), "step-response coefficient", "cv_unit per mv_unit", lag=lag
         ),
-        **_controller_variables(definition, process),
+        **_controller_variables(controllers, process),
     }
 
 
-def _controller_variables(definition: ComparisonDefinition, process: Process) -> dict[str, xr.DataArray]:
+def _controller_variables(
+    controllers: Sequence[ControllerDefinition], process: Process
+) -> dict[str, xr.DataArray]:
     """Tuning and kind of every controller, as variables over ``controller``."""
-    tunings = [controller.build_tuning(process) for controller in definition.controllers]
-    structures = [controller.structure(process) for controller in definition.controllers]
+    tunings = [controller.build_tuning(process) for controller in controllers]
+    structures = [controller.structure(process) for controller in controllers]
     out = {}
     for key, field in TUNING.items():
         values = np.stack([np.asarray(getattr(tuning, key), dtype=float) for tuning in tunings])
@@ -327,7 +350,7 @@ def _controller_variables(definition: ComparisonDefinition, process: Process) ->
         values = np.array([getattr(structure, key) for structure in structures], dtype="i4")
         out[key] = labelled(values, ("controller",), what, "1")
     for key in ("kind", "actuator", "blocking", "tuning"):
-        values = np.array([getattr(controller, key) for controller in definition.controllers], dtype=object)
+        values = np.array([getattr(controller, key) for controller in controllers], dtype=object)
         values = np.where(values == "", process.default_preset, values) if key == "tuning" else values
         out["tuning_preset" if key == "tuning" else key] = xr.DataArray(values, dims="controller")
     return out

@@ -2,7 +2,7 @@
 
 Some demanded rates can only be met with a little lift, 0 to 2000 m3/h, where a well slugs. `run_rto` lets the same
 mixed-integer controller follow the demands as they are, and follow what `steady.optimise` makes of them: rates within the
-demands' deadzones that need no such lift, and the choke and lift that belong to them as input targets (6.20).
+demands' deadzones that need no such lift, and the choke and lift that belong to them as ideal values (6.20).
 `figures.thesis.rto` draws the results.
 """
 
@@ -18,10 +18,9 @@ import xarray as xr
 from identify.plants import closing, model_of, open_plant, plant_facts
 from identify.steady_map import steady_map
 from jaxmpc.controller.controller import Controller
-from jaxmpc.controller.targets import TargetController
 from jaxmpc.files import write_atomically
+from jaxmpc.loop.events import Event
 from jaxmpc.loop.simulate import simulate
-from jaxmpc.loop.targets import simulate_with_targets
 from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure
@@ -53,7 +52,7 @@ DURATION, QUICK_DURATION = 28_800.0, 12_000.0  # s; the quick run ends before th
 PRICES = {GAS: 0.1, OIL: 400.0, LIFT: 0.3}  # per m3
 OPTIMISING = tuple(f"jaxmpc.steady.{name}" for name in ("optimise", "milp", "map"))  # set the targets
 SETTLED = 300.0  # s at the end of a window that stand for where a run settles
-TARGET_WEIGHT = {CHOKE: 1.0, LIFT: 1e-3}  # 1/(%)^2, 1/(m3/h)^2
+IDEAL_WEIGHT = {CHOKE: 1.0, LIFT: 1e-3}  # 1/(%)^2, 1/(m3/h)^2
 
 
 def demands(quick: bool = False) -> Reference:
@@ -121,12 +120,15 @@ def run_rto(
             with closing(open_plant(WELL, plant)) as well, progress_bar(label, progress) as report:
                 if name == WITHOUT:
                     return simulate(Controller(structure, tuning, model), well, demanded, progress=report)
-                setpoints, ideal = (
-                    Reference(demanded.times, [getattr(each, key) for each in found], demanded.duration)
-                    for key in ("cv", "mv")
+                setpoints = Reference(demanded.times, [each.cv for each in found], demanded.duration)
+                controller = Controller(
+                    structure, WELL.tuning(structure, changes={"ideal_weight": IDEAL_WEIGHT}), model
                 )
-                controller = TargetController(structure, tuning, model, TARGET_WEIGHT)
-                return simulate_with_targets(controller, well, setpoints, ideal, progress=report)
+                ideal = [
+                    Event(float(time), {"ideal": each.mv})
+                    for time, each in zip(demanded.times, found, strict=True)
+                ]
+                return simulate(controller, well, setpoints, events=ideal, progress=report)
 
         run_missing(folder, layout, run, say)
     write_atomically(folder / "summary.md", markdown(open_results(folder).load()))
@@ -154,13 +156,13 @@ def _layout(
         "tuning": WELL.tuning_fields(),
         "code": code,
     }
-    hashes = [content_hash(inputs, WITHOUT), content_hash(inputs, WITH, TARGET_WEIGHT)]
+    hashes = [content_hash(inputs, WITHOUT), content_hash(inputs, WITH, IDEAL_WEIGHT)]
     provenance = {
         "study": name,
         "title": "Low demands: mixed-integer MPC with and without real-time optimisation",
         "plant": facts,
         "prices": PRICES,
-        "target_weight": TARGET_WEIGHT,
+        "ideal_weight": IDEAL_WEIGHT,
         "lift_ranges": [list(pair) for pair in LIFT_RANGES],
         "messages": [each.message for each in found],
         "code": code,
@@ -169,7 +171,7 @@ def _layout(
         controllers=LABELS,
         hashes=hashes,
         structure=structure,
-        samples=demanded.samples(structure.dt),
+        times=structure.dt * np.arange(demanded.samples(structure.dt)),
         blocks=structure.block_count,
         shared=lambda: shared,
         provenance=provenance,
@@ -194,7 +196,7 @@ def _shared(
     return {
         "demanded": labelled(rates, ("time", "cv"), "demanded CV", "cv_unit"),
         "setpoint": labelled(setpoint, (*lanes, "cv"), "setpoint", "cv_unit"),
-        "target": labelled(target, (*lanes, "mv"), "input target", "mv_unit"),
+        "target": labelled(target, (*lanes, "mv"), "ideal value", "mv_unit"),
         "window": labelled(window.astype("i4"), ("time",), "index of the demand", "1"),
         "profit": labelled(profit, ("demand",), "steady profit of the target", "1/h"),
         "tuning_deadzone": labelled(half, ("controller", "cv"), "half width of the deadzone", "cv_unit"),

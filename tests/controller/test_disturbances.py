@@ -11,7 +11,6 @@ from jaxmpc.controller.checkpoint import load_controller, save_controller
 from jaxmpc.controller.controller import Controller, Controllers
 from jaxmpc.controller.plan import solve_plan
 from jaxmpc.controller.schedule import make_schedule
-from jaxmpc.controller.targets import TargetController
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import make_model
 from tests.conftest import second_order
@@ -125,7 +124,7 @@ def test_what_is_not_a_number_is_as_before(controller, model):
     assert not np.allclose(plain[1].moves, info.moves)
 
 
-def test_lanes_traced_steps_and_targets_feed_forward_alike(controller, model, small_structure, thesis_fields):
+def test_lanes_and_traced_steps_feed_forward_alike(controller, model, small_structure, thesis_fields):
     structure, horizon = controller.structure, controller.structure.prediction_horizon
     state = controller.init(*START)
     rows = stepping(horizon)
@@ -138,23 +137,20 @@ def test_lanes_traced_steps_and_targets_feed_forward_alike(controller, model, sm
     np.testing.assert_allclose(lanes.move, [alone.move, now.move], atol=1e-4)
     traced = jax.jit(lambda *given: controller.step(*given[:3], dv=given[3])[1].move)
     np.testing.assert_allclose(traced(state, START[0], SETPOINT, rows), alone.move, atol=1e-4)
-    free = TargetController(
-        structure, controller.tuning, model, {"choke": 0.0}
-    )  # a target that costs nothing
-    _, aimed = free.step(free.init(*START), START[0], SETPOINT, [50.0, 0.0], dv=rows)
-    np.testing.assert_allclose(aimed.move, alone.move, atol=1e-3)
 
 
 def test_a_saved_controller_knows_its_disturbances(controller, tmp_path):
-    aimed = TargetController(controller.structure, controller.tuning, controller.model, {"choke": 1.0})
-    for one, target in ((controller, ()), (aimed, ([50.0, 0.0],))):
-        state, _ = one.step(one.init(*START), START[0], SETPOINT, *target, dv=[3.0, 4.0])
+    weight = np.array([1.0, 0.0])
+    aimed = controller.with_tuning(
+        dataclasses.replace(controller.tuning, ideal=0.0 * weight, ideal_weight=weight)
+    )
+    for one in (controller, aimed):
+        state, _ = one.step(one.init(*START), START[0], SETPOINT, dv=[3.0, 4.0])
         path = save_controller(one, tmp_path / "controller.json", state)
         again, restored = load_controller(path)
         assert restored.dv.tolist() == [3.0, 4.0]
         steps = [
-            c.step(s, START[0], SETPOINT, *target, dv=[5.0, np.nan])
-            for c, s in ((one, state), (again, restored))
+            c.step(s, START[0], SETPOINT, dv=[5.0, np.nan]) for c, s in ((one, state), (again, restored))
         ]
         np.testing.assert_array_equal(steps[0][1].move, steps[1][1].move)
         body = json.loads(path.read_text())

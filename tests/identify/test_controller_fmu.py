@@ -21,7 +21,6 @@ from jaxmpc import (
     Controller,
     InputError,
     SensorFault,
-    TargetController,
     WellPlant,
     fault_errors,
     load_process,
@@ -288,10 +287,9 @@ def test_bad_input_is_refused_by_name_and_writes_nothing(path, start, field, tmp
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_controller_with_targets_is_refused(tmp_path):
-    other = TargetController.__new__(TargetController)
-    with pytest.raises(InputError, match="without targets"):
-        build_controller_fmu(other, tmp_path / "controller.fmu")
+def test_what_is_no_controller_is_refused(tmp_path):
+    with pytest.raises(InputError, match="expected a Controller"):
+        build_controller_fmu("heater", tmp_path / "controller.fmu")  # pyright: ignore
 
 
 def test_without_pythonfmu_the_message_says_what_to_install(monkeypatch, tmp_path):

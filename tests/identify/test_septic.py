@@ -169,6 +169,21 @@ def test_what_has_an_equal_survives_the_way_out_and_back(tmp_path, made):
     assert after["cv_weight"] == pytest.approx(before["soft_quadratic"] | {"Flow": 0.0})
 
 
+def test_an_ideal_value_that_is_on_is_one_here_and_comes_back(tmp_path):
+    text = CNFG.replace("IvOff=  100", "IvOn=  70\n          Fulf=  6", 1)
+    assert text != CNFG
+    made = converted(write(tmp_path / "in", text))
+    preset = made.body["presets"]["septic"]
+    (valve,) = preset["ideal"]
+    assert preset["ideal"] == {valve: 70.0}
+    assert preset["ideal_weight"] == {valve: pytest.approx(6 / 20**2)}  # its span is 20 %
+    process, out = stored(made, tmp_path / "one"), tmp_path / "out"
+    export_process(process, model_of(process), out, "", "span", Asked())
+    again = converted(out).body["presets"]["septic"]
+    assert again["ideal"][valve] == 70.0
+    assert again["ideal_weight"][valve] == pytest.approx(6 / 20**2)
+
+
 def test_a_shipped_process_goes_out_and_comes_back_with_its_feed_forward(tmp_path):
     process = load_process("wood-berry")
     model = model_of(process)

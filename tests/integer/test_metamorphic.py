@@ -54,8 +54,11 @@ def in_units(body: dict, cv=1.0, mv=1.0, cost=1.0) -> dict:
     mv = np.resize(mv, len(names["mv"])).astype(float)
     names["coefficients"] = (np.array(names["coefficients"]) * cv[:, None, None] / mv[:, None]).tolist()
     factors = {key: cost * cv**power for key, power in PER_CV.items()} | {"move_weight": cost / mv**2}
-    factors |= dict.fromkeys(LENGTHS, cv) | dict.fromkeys(MOVES, mv)
+    factors |= dict.fromkeys(LENGTHS, cv) | dict.fromkeys((*MOVES, "ideal"), mv)
+    factors["ideal_weight"] = factors["move_weight"]
     for key, factor in factors.items():
+        if key not in tuning:
+            continue
         tuning[key] = [v if v is None else float(v * f) for v, f in zip(tuning[key], factor, strict=True)]
     for key, factor in (("mv_now", mv), ("last_move", mv), ("free_response", cv), ("setpoint", cv)):
         body[key] = (np.array(body[key]) * factor).tolist()
@@ -114,6 +117,18 @@ def test_nor_do_they_where_weights_or_limits_are_left_out(twist):
             assert plan.status == "optimal"
             for ways in UNITS.values():
                 check_same(plan, solve(in_units(body, **ways)), ways.get("cost", 1.0))
+
+
+@pytest.mark.parametrize("shape", ["relaxed", "two integer MVs"])
+def test_nor_do_they_with_ideal_values(shape):
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        body = problems.small_case(rng, **SHAPES[shape])
+        problems.ideal_values(body, rng)
+        plan = solve(body)
+        assert plan.status == "optimal"
+        for ways in UNITS.values():
+            check_same(plan, solve(in_units(body, **ways)), ways.get("cost", 1.0))
 
 
 def test_a_plan_that_costs_nothing_is_proven_in_any_units():

@@ -4,16 +4,18 @@ Tests and benchmarks judge solvers with these, the library's own and foreign one
 prices, and nothing that a solver says of itself: objective, bound and status are not looked at, and no helper
 of the solvers is called. The problem is
 
-    min  sum Q t^2 + sum P x^2 + sum_k soft_k(t_k) + sum_m b_m(x) + sum_g rho_g max(0, violation_g),    t = theta x + t0,
+    min  sum Q t^2 + sum (A x + b)^2 + sum P x^2 + sum_k soft_k(t_k) + sum_m b_m(x) + sum_g rho_g max(0, violation_g),
+    t = theta x + t0,
     lower <= x <= upper,    row_low <= W x <= row_high,
 
 with soft(t) = S e^2 + s e, e = max(|t| - c, 0), the envelope b_m(x) = steep_m max(|x| - m, 0) of integer moves, and one
 group g per CV and side. With a price v for every soft row, w for every level of the envelope, p for every CV limit, mu for
 every hard row and lambda for every limit of x, a solution has (Boyd and Vandenberghe 2004, 5.5.3)
 
-    2 theta'Q t + 2 P x + theta'(v + p) + sum_m w_m + W'mu + lambda = 0,   v in the subdifferential of soft(t), ...
+    2 theta'Q t + 2 A'(A x + b) + 2 P x + theta'(v + p) + sum_m w_m + W'mu + lambda = 0,  v in the subdifferential of soft(t)
 
-The hard rows W are written out here, sample by sample; those of the library are products by structure.
+A x + b are the distances of MVs from their ideal values (6.20), where they have any. The hard rows W are written out here,
+sample by sample; those of the library are products by structure.
 """
 
 from __future__ import annotations
@@ -145,9 +147,9 @@ def kkt_residuals(
         row_high=solution.row_high_price,
     )
     objective = _objective(qp, instance, x, t)
-    flat = _cost_of_a_move(qp)
+    flat = _cost_of_a_move(qp, instance)
     cost = jnp.maximum(jnp.abs(objective), flat * LEAST_MOVE**2) + SMALLEST
-    forces = _forces(qp, w_matrix, x, t, prices)
+    forces = _forces(qp, instance, w_matrix, x, t, prices)
     force = jnp.maximum(jnp.max(jnp.abs(forces)), flat * LEAST_MOVE) + SMALLEST
     inequalities = (  # price, room to the limit, limit
         (prices.lower, x - lower, lower),
@@ -169,6 +171,16 @@ def kkt_residuals(
         / cost,
         gap=jnp.abs(objective - _dual_objective(qp, instance, x, prices, lower, upper)) / cost,
     )
+
+
+def _ideal(qp: CondensedQp, instance: QpInstance) -> tuple[Float[Array, "row n"], Float[Array, " row"]]:
+    """A and b."""
+    if qp.ideal is None or instance.distance is None:
+        return jnp.zeros((0, qp.scale.shape[0])), jnp.zeros(0)
+    mvs, rows, blocks = qp.ideal.by_move.shape
+    matrix = qp.ideal.by_move[:, :, None, :] * jnp.eye(mvs)[:, None, :, None]
+    offset = qp.ideal.by_distance * instance.distance[:, None]
+    return matrix.reshape(mvs * rows, mvs * blocks), offset.reshape(-1)
 
 
 def _largest(*values):
@@ -233,6 +245,8 @@ def _limit_products(qp: CondensedQp, instance: QpInstance, t, prices: _Prices):
 def _objective(qp: CondensedQp, instance: QpInstance, x, t):
     value = jnp.sum(qp.quadratic * t**2) + jnp.sum(qp.move_weight * x**2) + jnp.sum(_soft(qp, t))
     value += jnp.sum(_envelope(qp, x))
+    matrix, off = _ideal(qp, instance)
+    value += jnp.sum((matrix @ x + off) ** 2)
     for over in (t - instance.limit_high, instance.limit_low - t):
         value += qp.slack_weight @ jnp.maximum(_per_group(qp, over, jnp.max), 0.0)
     return value
@@ -242,6 +256,8 @@ def _dual_objective(qp: CondensedQp, instance: QpInstance, x, prices: _Prices, l
     """The Lagrangian less its gradient times x: the dual objective where the gradient vanishes."""
     offset = instance.offset
     value = jnp.sum(qp.quadratic * (offset**2 - (qp.theta @ x) ** 2)) - jnp.sum(qp.move_weight * x**2)
+    matrix, off = _ideal(qp, instance)
+    value += jnp.sum(off**2 - (matrix @ x) ** 2)
     value += jnp.sum(prices.row * offset - _soft_conjugate(qp, prices.row))
     value -= jnp.sum(_knots(qp) * jnp.minimum(jnp.abs(prices.envelope), qp.steep))
     for price, constant in (
@@ -256,12 +272,14 @@ def _dual_objective(qp: CondensedQp, instance: QpInstance, x, prices: _Prices, l
     return value
 
 
-def _forces(qp: CondensedQp, w_matrix, x, t, prices: _Prices) -> Float[Array, "term n"]:
+def _forces(qp: CondensedQp, instance: QpInstance, w_matrix, x, t, prices: _Prices) -> Float[Array, "term n"]:
     """Gradients in x of the terms of the Lagrangian, one row each; their sum is its gradient."""
     net = prices.high - prices.low
+    matrix, off = _ideal(qp, instance)
     return jnp.stack(
         [
             (2.0 * qp.quadratic * t) @ qp.theta,
+            2.0 * (matrix @ x + off) @ matrix,
             2.0 * qp.move_weight * x,
             prices.row @ qp.theta,
             jnp.sum(prices.envelope, axis=0),
@@ -272,10 +290,11 @@ def _forces(qp: CondensedQp, w_matrix, x, t, prices: _Prices) -> Float[Array, "t
     )
 
 
-def _cost_of_a_move(qp: CondensedQp) -> Float[Array, ""]:
+def _cost_of_a_move(qp: CondensedQp, instance: QpInstance) -> Float[Array, ""]:
     """What one scaled move costs at most, alone and away from every deadzone [objective]."""
     theta = jnp.abs(qp.theta)
     bent = (qp.quadratic + qp.soft_quadratic) @ theta**2 + qp.move_weight
+    bent += jnp.sum(_ideal(qp, instance)[0] ** 2, axis=0)
     return jnp.max(bent + qp.soft_linear @ theta + jnp.sum(qp.steep, axis=0))
 
 

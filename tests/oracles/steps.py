@@ -157,6 +157,7 @@ def full_form(case: dict) -> StepForm:
         return np.array([next(count) for _ in range(math.prod(shape))], dtype=int).reshape(shape)
 
     du, u, e = block(n.hu, n.mvs), block(n.hu, n.mvs), block(horizon, n.cvs)
+    away = block(horizon, n.mvs)
     eps_high, eps_low, eta = block(n.cvs), block(n.cvs), block(horizon, n.cvs)
     nothing = int(block(1)[0])  # the moves of a plan beyond the blocks of an MV
     total = next(count)
@@ -192,6 +193,10 @@ def full_form(case: dict) -> StepForm:
                 else:
                     past = round(n.last[m] / n.step[m])
                     row([(du[0, m], 1.0)], past - 1.0, past + 1.0)
+        for h in range(horizon):  # (6.20)
+            q[away[h, m]] = n.W[m] * units[m] ** 2
+            gap = (n.u0[m] - n.ideal[m]) / units[m]
+            row([(away[h, m], 1.0), (u[min(n.hw + h, n.hu) - 1, m], -1.0)], gap, gap)
         for start, length in zip(n.begins[m], n.lists[m], strict=True):  # (6.3)
             for k in range(start + 1, start + length):
                 same = [(du[start, m], -1.0)] if n.blocking == "moves" else []

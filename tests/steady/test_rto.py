@@ -404,10 +404,10 @@ def test_low_demands_of_the_study_get_a_lift_outside_the_band_and_rates_within_t
     assert 0.0 < inside.mv[1] < 2000.0
 
 
-def test_the_example_of_the_page_runs_as_typed(capsys):
+def test_the_examples_of_the_page_run_as_typed(capsys):
     page = (Path(__file__).resolve().parents[2] / "docs" / "rto.md").read_text()
-    (example,) = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
-    exec(compile(example, "docs/rto.md", "exec"), {"__name__": "__main__"})
+    examples = "".join(re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE))
+    exec(compile(examples, "docs/rto.md", "exec"), {"__name__": "__main__"})
     said = capsys.readouterr().out
     (shown,) = re.findall(r"^```text\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
     assert said == shown

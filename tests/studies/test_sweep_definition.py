@@ -443,13 +443,15 @@ def test_groups_and_chunks_hold_every_scenario_once_and_agree_in_shape():
             assert scenario.model_point in group.points
 
 
-def test_limits_part_groups_and_steps_do_not():
+def test_limits_and_ideal_values_part_groups_and_steps_do_not():
     no_limits = {
         n: {c: s * float("inf") for c in ("gas_rate", "oil_rate")}
         for n, s in (("cv_low", -1), ("cv_high", 1))
     }
     made = expand({"tuning": no_limits}, [axis("tuning.cv_high.gas_rate", 1e4, float("inf"))])
     assert [group.has_limits for group in made.groups] == [True, False]
+    made = expand(axes=[axis("tuning.ideal_weight.choke", 0, 1, 2)])
+    assert [(group.has_ideal, len(group.scenarios)) for group in made.groups] == [(False, 1), (True, 2)]
     made = expand(axes=[axis("tuning.move_high.choke", 2, 4)])
     assert len(made.groups) == 1
     made = expand({"controller": "continuous"}, [axis("tuning.move_high.choke", 2, 4)])
