@@ -9,6 +9,7 @@ show themselves.
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import io
 import os
@@ -73,14 +74,15 @@ def _fail(error: OSError) -> int:
     """What the system refused, in one line; a reader that has read enough, as `head` does, is no fault."""
     name = error.filename
     if name is None:
-        try:
-            sys.stdout.flush()
-            return complain(error.strerror or error, EXIT_OTHER)
-        except (OSError, ValueError) as unwritten:
-            sys.stdout = open(os.devnull, "w")  # noqa: SIM115  (the interpreter would try the rest again and complain)
-            if isinstance(unwritten, BrokenPipeError):
-                return EXIT_UNREAD
+        unread = isinstance(error, BrokenPipeError)
+        if not unread:
+            with contextlib.suppress(OSError, ValueError):
+                sys.stdout.flush()
+                return complain(error.strerror or error, EXIT_OTHER)
         name = "standard output"
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115  (the interpreter would try the rest again and complain)
+        if unread:
+            return EXIT_UNREAD
     return complain(f"{os.fsdecode(name)}: {error.strerror or error}", EXIT_OTHER)
 
 

@@ -171,10 +171,11 @@ def test_a_closed_standard_output_ends_with_one_line_where_something_was_to_be_p
     assert json.loads((tmp_path / "plan.json").read_text())["status"] == "optimal"
 
 
-def test_a_reader_that_leaves_ends_the_command_quietly():
+@pytest.mark.parametrize("words", [["figures"], ["process", "list"]], ids=" ".join)
+def test_a_reader_that_leaves_ends_the_command_quietly(words):
     reading, writing = os.pipe()
     os.close(reading)
-    run = command("figures", stdout=writing)
+    run = command(*words, stdout=writing)
     os.close(writing)
     assert (run.returncode, run.stderr) == (141, "")
 
