@@ -16,6 +16,7 @@ from jaxmpc.errors import InputError
 
 WAYS = {"up": 1.0, "down": -1.0, "half up": 0.5, "half down": -0.5}  # sizes of the tests
 SHARE = 0.01  # of the range of an input, or of its value: a step if none is given
+FURTHER = 10.0  # times the step of the tests, where those have shown nothing
 WIDEST = 1e12  # a range beyond says nothing
 
 
@@ -68,6 +69,8 @@ def moved(
     rest = found.number if value is None else float(found.exactly(field, value))
     if rest is None:
         raise InputError(field, "no value", f"{found.expected}: the FMU has no start value")
+    if found.nearest(rest) != rest:
+        raise InputError(field, rest, found.expected, "That is its start value; give another")
     if step is not None and not (is_number(step) and step != 0):
         raise InputError(field, step, "a step that is not zero")
     targets, notes = _targets(found, rest, None if step is None else abs(step), ways)
@@ -114,6 +117,13 @@ def _size(v: FmuVariable, rest: float) -> float:
     bounded = v.low is not None and v.high is not None and high - low < WIDEST
     size = SHARE * ((high - low) if bounded else abs(rest))
     return max(1.0, math.floor(size)) if v.type in BITS else size
+
+
+def further(one: Moved) -> float | None:
+    """Where a step ten times as large goes, within the range of an input; None if no further than the tests."""
+    tested = max(abs(to - one.rest) for to in one.targets.values())
+    ends = (float(one.variable.nearest(one.rest + sign * FURTHER * tested)) for sign in (1, -1))
+    return next((to for to in ends if abs(to - one.rest) > 1.5 * tested), None)
 
 
 def error_of(one: Moved) -> float:

@@ -7,6 +7,7 @@ it (`identify.fmu_verdicts`). Noise that does not repeat is averaged over runs. 
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import hashlib
 import itertools
@@ -19,13 +20,13 @@ from jaxtyping import Float
 
 from identify.fmu import FmuPlant
 from identify.fmu_description import BITS, REALS, FmuDescription, Value
-from identify.fmu_inputs import WAYS, Moved, actuator_of, error_of, legal_names, moved
+from identify.fmu_inputs import WAYS, Moved, actuator_of, error_of, further, legal_names, moved
 from identify.fmu_process import TIME_LIMIT, FmuProcess
-from identify.fmu_verdicts import Tests, advice_of, judged
+from identify.fmu_verdicts import NOTHING, Tests, advice_of, judged
 from identify.step_test import SETTLE_SAMPLES
 from jaxmpc.check import is_count, is_number
 from jaxmpc.controller.schedule import ModelSchedule, make_schedule
-from jaxmpc.errors import InputError, near
+from jaxmpc.errors import InputError, PlantError, near
 from jaxmpc.model.identification import Identification, Record
 from jaxmpc.model.step_response import StepResponseModel, make_model
 
@@ -259,10 +260,10 @@ class _Tests:
             mean = np.where(np.isnan(pairs).any(axis=0), np.nansum(pairs, axis=0), pairs.mean(axis=0))
         point = base.mean(axis=0) if noise.any() else base[0]
         model = self._model(mean, point, settle, {})
-        seen = Tests(
-            model, responses, errors, changes, np.maximum(scale, changes.max(axis=1)), base,
-            [v.type in REALS for v in self.cv_variables],
-        )  # fmt: skip
+        scale = np.maximum(scale, changes.max(axis=1))
+        more = self._further(settle, (changes <= NOTHING * scale[:, None]) & (noise == 0)[:, None], base)
+        whole = [v.type in REALS for v in self.cv_variables]
+        seen = Tests(model, responses, errors, changes, scale, more, base, whole)
         verdicts, notes = judged(seen)
         notes = (*self.notes, *self._noise_notes(noise, most), *notes)
         silent = np.array([row.verdict == "none" for row in verdicts]).reshape(mean.shape[:2])
@@ -295,6 +296,20 @@ class _Tests:
                     total[way] = (total[way] + again.sum(axis=0)) / (more + 1)
         means.update({(j, way): run for way, run in total.items()})
         return count
+
+    def _further(self, settle: float, silent: np.ndarray, base: np.ndarray) -> Float[np.ndarray, "cv input"]:
+        """Largest change of CVs that an input has not moved, after a much larger step of it; 0 where there is none."""
+        found = np.zeros(silent.shape)
+        for j in np.flatnonzero(silent.any(axis=0)):
+            target = further(self.inputs[j])
+            if target is None:
+                continue
+            self.tell(f"a larger step of {self.inputs[j].channel}, which has not moved a CV")
+            # in a process of its own: where it fails, so far away, the tests are what they are
+            with contextlib.suppress(PlantError), self.plant_of(settle) as plant:
+                change = np.abs(self._runs(plant, self._stepped(j, target), 1)[0] - base).max(axis=0)
+                found[:, j] = np.where(silent[:, j], change, 0.0)
+        return found
 
     def _stepped(self, j: int, target: float) -> np.ndarray:
         mv = self.rest.copy()
