@@ -60,7 +60,7 @@ def write_page(found: Identification, path: str | Path) -> Path:
     sections = [one for one in sections if one[2]]
     blanks = {
         "title": f"Model of {escape(', '.join(model.cv_names))}",
-        "about": f"What {escape(inputs)} do to them, {model.samples} samples of {model.dt:g} s. Worst verdict: "
+        "about": f"Responses to {escape(inputs)}: {model.samples} samples of {model.dt:g} s. Worst verdict: "
         f"<strong>{found.worst}</strong>.",
         "contents": "\n".join(f'<li><a href="#{key}">{title}</a></li>' for key, title, _ in sections),
         "body": "\n".join(

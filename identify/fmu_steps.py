@@ -300,12 +300,12 @@ class _Tests:
     def _further(self, settle: float, silent: np.ndarray, base: np.ndarray) -> Float[np.ndarray, "cv input"]:
         """Largest change of CVs that an input has not moved, after a much larger step of it; 0 where there is none."""
         found = np.zeros(silent.shape)
-        for j in np.flatnonzero(silent.any(axis=0)):
+        for j in np.flatnonzero(silent.any(axis=0)).tolist():
             target = further(self.inputs[j])
             if target is None:
                 continue
             self.tell(f"a larger step of {self.inputs[j].channel}, which has not moved a CV")
-            # in a process of its own: where it fails, so far away, the tests are what they are
+            # so far away it may fail, in a process of its own: the tests are what they are
             with contextlib.suppress(PlantError), self.plant_of(settle) as plant:
                 change = np.abs(self._runs(plant, self._stepped(j, target), 1)[0] - base).max(axis=0)
                 found[:, j] = np.where(silent[:, j], change, 0.0)

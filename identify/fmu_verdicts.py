@@ -112,7 +112,9 @@ def _pair(tests: Tests, i: int, j: int, row: Settling) -> tuple[Verdict, str]:
     looks += [says] if says else []
     if faint:
         part = tests.changes[i, j] / tests.scale[i]
-        looks.append(f"it moves by {part:.1g} of its value only, which tolerances of a solver may blur: step further")
+        looks.append(
+            f"it moves by {part:.1g} of its value only, which tolerances of a solver may blur: step further"
+        )
     share = 1.96 * error / peak
     if share > LEFT:
         looks.append(f"noise leaves +-{100 * share:.2g} % of its largest value: larger steps leave less")
@@ -199,8 +201,8 @@ def _sizes(tests: Tests, i: int, j: int, peak: float, error: float) -> tuple[flo
         worst, says = (
             apart,
             (
-                f"a step up and one down differ by {100 * apart:.3g} %: gain {up:.4g} up, {down + 0.0:.4g} down; smaller steps, "
-                "or a gain schedule (--at)"
+                f"a step up and one down differ by {100 * apart:.3g} %: gain {up:.4g} up, {down + 0.0:.4g} down; smaller "
+                "steps, or a gain schedule (--at)"
             ),
         )
     if halves:
