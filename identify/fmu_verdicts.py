@@ -153,6 +153,14 @@ def _stands_out(s: np.ndarray, error: float, expected: float) -> bool:
     return bool(np.abs(s).max() > 1.5 * expected or abs(tail.mean()) > 5 * error / math.sqrt(len(tail)))
 
 
+def movement_of(cv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """By how much the second half of a record differs from the first in the mean, and the error of that by noise."""
+    half = len(cv) // 2
+    movement = np.abs(cv[half:].mean(axis=0) - cv[:half].mean(axis=0))
+    noise = np.diff(cv, n=2, axis=0).std(axis=0) / math.sqrt(6)
+    return movement, noise * 2 / math.sqrt(len(cv)) / 2
+
+
 def _drift(base: np.ndarray) -> float:
     """By how much a CV moves without a step, beyond noise."""
     half = len(base) // 2

@@ -110,6 +110,17 @@ def test_what_a_plant_does_besides_is_not_in_its_response(tmp_path, code, exact)
     assert off(found(plant(tmp_path, states=2, **code)), exact) < CLOSE
 
 
+@pytest.mark.parametrize(
+    ("code", "exact"),
+    [(LAG | {"initial": "x[0] = 100"}, EXACT), ({"rates": "d[0] = u[0] - 50", "outputs": "y[0] = x[0]"}, T)],
+    ids=["at rest", "integrates"],
+)
+def test_an_fmu_whose_reset_does_nothing_is_run_in_new_processes(tmp_path, code, exact):
+    got = found(plant(tmp_path, reset="return 0", **(code | {"states": 1})))
+    assert off(got, exact) < CLOSE
+    assert any("does not reset it" in note for note in got.notes)
+
+
 @pytest.mark.parametrize(("at", "way"), [(0, "up"), (100, "down")])
 def test_at_a_limit_steps_go_the_way_that_is_left(tmp_path, at, way):
     got = found(plant(tmp_path), {"u": (float(at), 2.0)})
