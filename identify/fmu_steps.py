@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from identify.fmu import FmuPlant
 from identify.fmu_description import BITS, REALS, FmuDescription, Value
-from identify.fmu_inputs import WAYS, Moved, actuator_of, error_of, further, legal_names, moved
+from identify.fmu_inputs import WAYS, Moved, actuator_of, error_of, further, legal_names, moved, repeats
 from identify.fmu_process import TIME_LIMIT, FmuProcess
 from identify.fmu_verdicts import NOTHING, Tests, advice_of, judged, movement_of
 from identify.step_test import SETTLE_SAMPLES
@@ -35,9 +35,6 @@ STILL = 1e-6  # of all that it has moved: it has settled
 GROWING = (
     8.0  # times steeper from one stretch to the next, twice as long one, and ever more: an FMU that runs away
 )
-PRECISE = 0.001  # of the largest coefficient: standard error that repetitions are to reach
-MOST_REPEATS = 2000
-MOST_SAMPLES = 2_000_000  # simulated for the tests of one input
 REPEATED = 1e-9  # of the largest value: two runs are the same
 
 Told = Callable[[str], None]
@@ -302,7 +299,7 @@ class _Tests:
         for way, target in one.targets.items():
             total[way] = self._runs(plant, self._stepped(j, target), 1)[0]
         if noise.any():
-            count = self._repeats(one, total, base, noise, settle)
+            count = repeats(one, total, base, noise, self.samples, settle / self.dt)
             for way, target in one.targets.items():
                 more = count - 1 if "half" not in way else max(count // 4, 1) - 1
                 if more:
@@ -330,20 +327,6 @@ class _Tests:
         mv = self.rest.copy()
         mv[j] = target
         return mv
-
-    def _repeats(self, one, total, base, noise, settle) -> int:
-        """How often a test is made, so that the mean of the noise is small beside the responses."""
-        smooth = max(self.samples // 10, 1)
-        kernel = np.ones(smooth) / smooth
-        need = 1.0
-        for i in np.flatnonzero(noise):
-            ways = [way for way in ("up", "down") if way in one.targets]
-            changes = [np.abs(np.convolve((total[w] - base)[1:, i], kernel, "valid")).max() for w in ways]
-            peak, error = max(changes), noise[i] * error_of(one) * abs(one.targets[ways[0]] - one.rest)
-            if peak > 5 * noise[i] / math.sqrt(smooth):
-                need = max(need, (error / (PRECISE * peak)) ** 2)
-        cost = len(one.targets) * (self.samples + settle / self.dt)
-        return int(min(math.ceil(need), MOST_REPEATS, max(MOST_SAMPLES / cost, 2)))
 
     # ------------------------------------------------------------------------------------------------- what is returned
 
