@@ -191,7 +191,7 @@ class FmuPlant:
         found = self.description.variable(field, self._variables.get(name, name))
         if found.causality not in ("output", "local") or found.type not in NUMBERS:
             expected = f"an output or a local variable that holds a number (this is {_kind(found)})"
-            raise InputError(field, name, expected)
+            raise InputError(field, found.name, expected)
         return found
 
     def _rest(self, field: str, name: str, found: FmuVariable, given: Mapping[str, Value]) -> float:

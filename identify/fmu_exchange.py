@@ -14,7 +14,8 @@ import numpy as np
 from fmpy.sundials import NV_DATA_S, CVodeSolver, SUNContext_PushErrHandler
 from fmpy.sundials.libraries import sundials_core
 
-TOLERANCE = 1e-8  # relative; small steps of an input change large states by little
+TOLERANCE = 1e-9  # relative; small steps of an input change large states by little
+ABSOLUTE = 1e-12  # of the nominal value, which is 1 in most FMUs, also of states that are small
 MAX_STEPS = 1_000_000  # of the solver between two points; the time limit of a call ends it before
 CLOSE = 1e-10  # of a time: two times that are one
 
@@ -145,7 +146,7 @@ class Exchange:
             set_x=fmu.setContinuousStates,
             get_dx=fmu.getContinuousStateDerivatives if self._fmi3 else fmu.getDerivatives,
             get_z=fmu.getEventIndicators,
-            get_nominals=fmu.getNominalsOfContinuousStates,
+            get_nominals=self._scales,
             set_time=fmu.setTime,
             input=_Held(),
             startTime=self._time,
@@ -153,6 +154,12 @@ class Exchange:
             relativeTolerance=TOLERANCE,
             maxNumSteps=MAX_STEPS,
         )
+
+    def _scales(self, scales: Any, count: int) -> None:
+        """Nominal values, so small that the absolute tolerance made of them is that of small states too."""
+        self._fmu.getNominalsOfContinuousStates(scales, count)
+        nominals = np.ctypeslib.as_array(scales, (count,))
+        nominals[:] = ABSOLUTE / TOLERANCE * np.where(nominals == 0.0, 1.0, np.abs(nominals))
 
 
 def _check(ends: Any) -> None:

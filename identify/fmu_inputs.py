@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from identify.fmu_description import BITS, NUMBERS, FmuDescription, FmuVariable, Value
 from jaxmpc.check import is_number
@@ -16,6 +18,10 @@ from jaxmpc.errors import InputError
 
 WAYS = {"up": 1.0, "down": -1.0, "half up": 0.5, "half down": -0.5}  # sizes of the tests
 SHARE = 0.01  # of the range of an input, or of its value: a step if none is given
+FURTHER = 10.0  # times the step of the tests, where those have shown nothing
+PRECISE = 0.001  # of the largest coefficient: standard error that repetitions are to reach
+MOST_REPEATS = 2000
+MOST_SAMPLES = 2_000_000  # simulated for the tests of one input
 WIDEST = 1e12  # a range beyond says nothing
 
 
@@ -68,6 +74,8 @@ def moved(
     rest = found.number if value is None else float(found.exactly(field, value))
     if rest is None:
         raise InputError(field, "no value", f"{found.expected}: the FMU has no start value")
+    if found.nearest(rest) != rest:
+        raise InputError(field, rest, found.expected, "That is its start value; give another")
     if step is not None and not (is_number(step) and step != 0):
         raise InputError(field, step, "a step that is not zero")
     targets, notes = _targets(found, rest, None if step is None else abs(step), ways)
@@ -116,10 +124,41 @@ def _size(v: FmuVariable, rest: float) -> float:
     return max(1.0, math.floor(size)) if v.type in BITS else size
 
 
+def further(one: Moved) -> float | None:
+    """Where a step ten times as large goes, within the range of an input; None if no further than the tests."""
+    tested = max(abs(to - one.rest) for to in one.targets.values())
+    ends = (float(one.variable.nearest(one.rest + sign * FURTHER * tested)) for sign in (1, -1))
+    return next((to for to in ends if abs(to - one.rest) > 1.5 * tested), None)
+
+
 def error_of(one: Moved) -> float:
     """Standard error of a coefficient from runs with noise of 1 [per input unit]."""
     shares = [1 / (one.targets[way] - one.rest) for way in ("up", "down") if way in one.targets]
     return math.hypot(*shares, sum(shares)) / len(shares)  # of the tests, and of the run without steps
+
+
+def repeats(one: Moved, total: Mapping[str, Any], base: Any, noise: Any, samples: int, before: float) -> int:
+    """How often a test is made, so that the mean of the noise is small beside the responses.
+
+    Args:
+        one: input that is stepped.
+        total: a run of each of its tests, ``"sample cv"`` [CV unit].
+        base: the mean without steps.
+        noise: standard deviations, by CV.
+        samples: of a response.
+        before: simulated before a step [samples].
+    """
+    smooth = max(samples // 10, 1)
+    kernel = np.ones(smooth) / smooth
+    need = 1.0
+    for i in np.flatnonzero(noise):
+        ways = [way for way in ("up", "down") if way in one.targets]
+        changes = [np.abs(np.convolve((total[w] - base)[1:, i], kernel, "valid")).max() for w in ways]
+        peak, error = max(changes), noise[i] * error_of(one) * abs(one.targets[ways[0]] - one.rest)
+        if peak > 5 * noise[i] / math.sqrt(smooth):
+            need = max(need, (error / (PRECISE * peak)) ** 2)
+    cost = len(one.targets) * (samples + before)
+    return int(min(math.ceil(need), MOST_REPEATS, max(MOST_SAMPLES / cost, 2)))
 
 
 def actuator_of(v: FmuVariable) -> dict[str, Any] | None:

@@ -7,6 +7,7 @@ it (`identify.fmu_verdicts`). Noise that does not repeat is averaged over runs. 
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import hashlib
 import itertools
@@ -19,13 +20,13 @@ from jaxtyping import Float
 
 from identify.fmu import FmuPlant
 from identify.fmu_description import BITS, REALS, FmuDescription, Value
-from identify.fmu_inputs import WAYS, Moved, actuator_of, error_of, legal_names, moved
+from identify.fmu_inputs import WAYS, Moved, actuator_of, error_of, further, legal_names, moved, repeats
 from identify.fmu_process import TIME_LIMIT, FmuProcess
-from identify.fmu_verdicts import Tests, advice_of, judged
+from identify.fmu_verdicts import NOTHING, Tests, advice_of, judged, movement_of
 from identify.step_test import SETTLE_SAMPLES
 from jaxmpc.check import is_count, is_number
 from jaxmpc.controller.schedule import ModelSchedule, make_schedule
-from jaxmpc.errors import InputError, near
+from jaxmpc.errors import InputError, PlantError, near
 from jaxmpc.model.identification import Identification, Record
 from jaxmpc.model.step_response import StepResponseModel, make_model
 
@@ -34,9 +35,6 @@ STILL = 1e-6  # of all that it has moved: it has settled
 GROWING = (
     8.0  # times steeper from one stretch to the next, twice as long one, and ever more: an FMU that runs away
 )
-PRECISE = 0.001  # of the largest coefficient: standard error that repetitions are to reach
-MOST_REPEATS = 2000
-MOST_SAMPLES = 2_000_000  # simulated for the tests of one input
 REPEATED = 1e-9  # of the largest value: two runs are the same
 
 Told = Callable[[str], None]
@@ -171,6 +169,10 @@ class _Tests:
             description=self.description,
         )
         self.rest = np.array([one.rest for one in self.inputs])
+        self.anew, self.begin = (
+            False,
+            np.full(len(cvs), np.nan),
+        )  # new processes for runs; CVs that all begin with
         self.plant_of(0.0)  # checked before anything is simulated
 
     def tell(self, what: str) -> None:
@@ -197,12 +199,12 @@ class _Tests:
                 cv = plant.hold(self.rest, length)
                 record.extend(cv)
                 run = np.array(record)
-                movement, noise = _movement(cv[-self.block :])
+                movement, noise = movement_of(cv[-self.block :])
                 still = STILL * np.ptp(run, axis=0) + REPEATED * np.abs(run).max(axis=0) + 8 * noise
                 busy = movement > still
                 if not busy.any():
                     return (len(record) - 1) * self.dt if np.ptp(run, axis=0).any() else 0.0
-                slopes.append(_movement(cv)[0] / length)
+                slopes.append(movement_of(cv)[0] / length)
                 if len(slopes) > 2:
                     first, before, last = (slope[busy] for slope in slopes[-3:])
                     if ((last > GROWING * before) & (last * first > before**2)).any():
@@ -226,7 +228,17 @@ class _Tests:
         """CVs of runs with held MVs from the working point on, the first sample before they act."""
         runs = []
         for _ in range(count):
-            runs.append(np.vstack([plant.init().cv, plant.hold(mv, self.samples)]))
+            if self.anew:
+                plant.close()
+            begin = plant.init().cv
+            if not self.anew and (np.abs(begin - self.begin) > REPEATED * np.abs(self.begin)).any():
+                self.anew = True
+                self.notes.append(
+                    "the reset of the FMU does not reset it: every run is made in a new process"
+                )
+                plant.close()
+                begin = plant.init().cv
+            runs.append(np.vstack([begin, plant.hold(mv, self.samples)]))
         return np.array(runs)
 
     def _identified(self, plant: FmuPlant, settle: float) -> Identification:
@@ -235,6 +247,7 @@ class _Tests:
         scale = np.abs(still).max(axis=(0, 1))
         apart = np.abs(still[0] - still[1]).max(axis=0)
         noise = np.where(apart > REPEATED * scale, (still[0] - still[1]).std(axis=0) / math.sqrt(2), 0.0)
+        self.begin = np.where(noise == 0, still[0, 0], np.nan)
         shape = (len(self.cvs), len(self.inputs), self.samples)
         responses = {way: np.full(shape, np.nan) for way in self.ways}
         errors, changes = np.zeros(shape[:2]), np.zeros(shape[:2])
@@ -259,10 +272,10 @@ class _Tests:
             mean = np.where(np.isnan(pairs).any(axis=0), np.nansum(pairs, axis=0), pairs.mean(axis=0))
         point = base.mean(axis=0) if noise.any() else base[0]
         model = self._model(mean, point, settle, {})
-        seen = Tests(
-            model, responses, errors, changes, np.maximum(scale, changes.max(axis=1)), base,
-            [v.type in REALS for v in self.cv_variables],
-        )  # fmt: skip
+        scale = np.maximum(scale, changes.max(axis=1))
+        more = self._further(settle, (changes <= NOTHING * scale[:, None]) & (noise == 0)[:, None], base)
+        whole = [v.type in REALS for v in self.cv_variables]
+        seen = Tests(model, responses, errors, changes, scale, more, base, whole)
         verdicts, notes = judged(seen)
         notes = (*self.notes, *self._noise_notes(noise, most), *notes)
         silent = np.array([row.verdict == "none" for row in verdicts]).reshape(mean.shape[:2])
@@ -286,7 +299,7 @@ class _Tests:
         for way, target in one.targets.items():
             total[way] = self._runs(plant, self._stepped(j, target), 1)[0]
         if noise.any():
-            count = self._repeats(one, total, base, noise, settle)
+            count = repeats(one, total, base, noise, self.samples, settle / self.dt)
             for way, target in one.targets.items():
                 more = count - 1 if "half" not in way else max(count // 4, 1) - 1
                 if more:
@@ -296,24 +309,24 @@ class _Tests:
         means.update({(j, way): run for way, run in total.items()})
         return count
 
+    def _further(self, settle: float, silent: np.ndarray, base: np.ndarray) -> Float[np.ndarray, "cv input"]:
+        """Largest change of CVs that an input has not moved, after a much larger step of it; 0 where there is none."""
+        found = np.zeros(silent.shape)
+        for j in np.flatnonzero(silent.any(axis=0)).tolist():
+            target = further(self.inputs[j])
+            if target is None:
+                continue
+            self.tell(f"a larger step of {self.inputs[j].channel}, which has not moved a CV")
+            # so far away it may fail, in a process of its own: the tests are what they are
+            with contextlib.suppress(PlantError), self.plant_of(settle) as plant:
+                change = np.abs(self._runs(plant, self._stepped(j, target), 1)[0] - base).max(axis=0)
+                found[:, j] = np.where(silent[:, j], change, 0.0)
+        return found
+
     def _stepped(self, j: int, target: float) -> np.ndarray:
         mv = self.rest.copy()
         mv[j] = target
         return mv
-
-    def _repeats(self, one, total, base, noise, settle) -> int:
-        """How often a test is made, so that the mean of the noise is small beside the responses."""
-        smooth = max(self.samples // 10, 1)
-        kernel = np.ones(smooth) / smooth
-        need = 1.0
-        for i in np.flatnonzero(noise):
-            ways = [way for way in ("up", "down") if way in one.targets]
-            changes = [np.abs(np.convolve((total[w] - base)[1:, i], kernel, "valid")).max() for w in ways]
-            peak, error = max(changes), noise[i] * error_of(one) * abs(one.targets[ways[0]] - one.rest)
-            if peak > 5 * noise[i] / math.sqrt(smooth):
-                need = max(need, (error / (PRECISE * peak)) ** 2)
-        cost = len(one.targets) * (self.samples + settle / self.dt)
-        return int(min(math.ceil(need), MOST_REPEATS, max(MOST_SAMPLES / cost, 2)))
 
     # ------------------------------------------------------------------------------------------------- what is returned
 
@@ -378,11 +391,3 @@ class _Tests:
             f"{name} is called {channel} here: a process file has names of letters, digits and '_'"
             for channel, name in self.renamed.items()
         ]
-
-
-def _movement(cv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """By how much the second half of a record differs from the first in the mean, and the error of that by noise."""
-    half = len(cv) // 2
-    movement = np.abs(cv[half:].mean(axis=0) - cv[:half].mean(axis=0))
-    noise = np.diff(cv, n=2, axis=0).std(axis=0) / math.sqrt(6)
-    return movement, noise * 2 / math.sqrt(len(cv)) / 2

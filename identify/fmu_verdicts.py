@@ -18,7 +18,7 @@ from jaxmpc.model.identification import PairVerdict, Verdict
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.process import amount
 
-NOTHING = 1e-7  # of the largest value of a CV: a change that is no response
+NOTHING = 1e-7  # of the largest value of a CV: a change that is no response, unless all tests agree on it
 CURVED, BENT = (
     0.05,
     0.5,
@@ -37,6 +37,7 @@ class Tests(NamedTuple):
         errors: standard errors of the coefficients by noise that differs from run to run.
         changes: largest change of a CV in the tests of an input [CV unit].
         scale: largest value of a CV [CV unit].
+        further: largest change after a much larger step, where the tests have changed nothing; 0 elsewhere [CV unit].
         base: without steps.
         continuous: whether a CV takes every value.
     """
@@ -46,6 +47,7 @@ class Tests(NamedTuple):
     errors: Float[np.ndarray, "cv input"]
     changes: Float[np.ndarray, "cv input"]
     scale: Float[np.ndarray, " cv"]
+    further: Float[np.ndarray, "cv input"]
     base: Float[np.ndarray, "sample cv"]
     continuous: Sequence[bool]
 
@@ -94,15 +96,25 @@ def _pair(tests: Tests, i: int, j: int, row: Settling) -> tuple[Verdict, str]:
     tested = np.stack([found[i, j] for found in tests.responses.values() if np.isfinite(found[i, j]).all()])
     error, peak = float(tests.errors[i, j]), float(np.abs(tested).max())
     expected_peak = error * math.sqrt(2 * math.log(2 * len(s) + 1))  # of noise alone
-    if tests.changes[i, j] <= NOTHING * tests.scale[i] or (
-        error and not _stands_out(s, error, expected_peak)
-    ):
+    faint = tests.changes[i, j] <= NOTHING * tests.scale[i]
+    unseen = faint and _apart(tests, i, j) > CURVED
+    if unseen and tests.further[i, j] > NOTHING * tests.scale[i]:
+        return "bad", (
+            f"no response to these steps, but a larger one moves it by {amount(tests.further[i, j], cv_unit)}: a dead band, "
+            "a valve that sticks, or steps too small to be seen; step further (--mv NAME=VALUE:STEP)"
+        )
+    if unseen or (error and not _stands_out(s, error, expected_peak)):
         return "none", f"no response: at most {np.abs(s).max():.3g}{per}" + (
             " within the noise" if error else ""
         )
     words, looks = response_words(row, s, per, model.dt), []
     runaway, says = _moving(s, row, model.dt, per, error)
     looks += [says] if says else []
+    if faint:
+        part = tests.changes[i, j] / tests.scale[i]
+        looks.append(
+            f"it moves by {part:.1g} of its value only, which tolerances of a solver may blur: step further"
+        )
     share = 1.96 * error / peak
     if share > LEFT:
         looks.append(f"noise leaves +-{100 * share:.2g} % of its largest value: larger steps leave less")
@@ -126,10 +138,27 @@ def _pair(tests: Tests, i: int, j: int, row: Settling) -> tuple[Verdict, str]:
     return verdict, "; ".join([words, *looks])
 
 
+def _apart(tests: Tests, i: int, j: int) -> float:
+    """Largest difference of all tests as a share of the response: rounding and a solver's tolerances differ by size."""
+    tested = {way: found[i, j] for way, found in tests.responses.items() if np.isfinite(found[i, j]).all()}
+    peak = max(np.abs(found).max() for found in tested.values())
+    if not peak or all("half" not in way for way in tested):
+        return math.inf
+    return float(np.ptp(np.stack(list(tested.values())), axis=0).max() / peak)
+
+
 def _stands_out(s: np.ndarray, error: float, expected: float) -> bool:
     """Whether a response is more than noise: in one sample, or in the mean of its last quarter."""
     tail = s[-max(len(s) // 4, 1) :]
     return bool(np.abs(s).max() > 1.5 * expected or abs(tail.mean()) > 5 * error / math.sqrt(len(tail)))
+
+
+def movement_of(cv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """By how much the second half of a record differs from the first in the mean, and the error of that by noise."""
+    half = len(cv) // 2
+    movement = np.abs(cv[half:].mean(axis=0) - cv[:half].mean(axis=0))
+    noise = np.diff(cv, n=2, axis=0).std(axis=0) / math.sqrt(6)
+    return movement, noise * 2 / math.sqrt(len(cv)) / 2
 
 
 def _drift(base: np.ndarray) -> float:
@@ -180,8 +209,8 @@ def _sizes(tests: Tests, i: int, j: int, peak: float, error: float) -> tuple[flo
         worst, says = (
             apart,
             (
-                f"a step up and one down differ by {100 * apart:.3g} %: gain {up:.4g} up, {down:.4g} down; smaller steps, "
-                "or a gain schedule (--at)"
+                f"a step up and one down differ by {100 * apart:.3g} %: gain {up:.4g} up, {down + 0.0:.4g} down; smaller "
+                "steps, or a gain schedule (--at)"
             ),
         )
     if halves:

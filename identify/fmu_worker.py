@@ -350,12 +350,25 @@ class Runner:
                 if self._exchange is not None:
                     self._exchange.step(end, dt)
                 else:
-                    said = self._fmu.doStep(self._time, dt)
-                    if self.fmi == 3 and said[1]:
-                        raise RuntimeError("it asks for the end of the simulation")
+                    self._do_step(self._time, end)
             except Exception as error:
                 raise RuntimeError(f"{error}{self._beyond()}") from None
             self._time = end
+
+    def _do_step(self, begin: float, end: float) -> None:
+        """One communication step; one of FMI 3 that returns early is gone on with."""
+        while True:
+            said = self._fmu.doStep(begin, end - begin)
+            if self.fmi == 2:
+                return
+            _, ends, early, reached = said
+            if ends:
+                raise RuntimeError("it asks for the end of the simulation")
+            if not early or end - reached <= 1e-9 * (end - begin):
+                return
+            if reached <= begin:
+                raise RuntimeError(f"it returns early at {reached:.10g} s, where it was")
+            begin = reached
 
     def sample(self, dt: float, count: int, names: list[str]) -> list[Any]:
         """Step and read."""

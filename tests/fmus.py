@@ -138,7 +138,7 @@ TYPE(UInt8, uint8_t) TYPE(UInt16, uint16_t) TYPE(UInt32, uint32_t) TYPE(UInt64, 
 void *fmi3InstantiateCoSimulation(const char *name, const char *guid) { return strcmp(guid, GUID) ? 0 : x; }
 int fmi3Reset(void *c) { memset(x, 0, sizeof x); return 0; }
 int fmi3DoStep(void *c, double t, double h, bool p, bool *event, bool *stop, bool *early, double *last)
-{ *event = *early = false; *stop = t + h > 50; *last = x[0] = t + h; return 0; }
+{ *event = *early = false; DO_STEP; *stop = t + h > 50; *last = x[0] = t + h; return 0; }
 """
 
 
@@ -189,12 +189,12 @@ def make_fmu(folder: Path, description: str | None = None, **code: str) -> Path:
     return pack(folder / "test.fmu", content)
 
 
-def make_fmu3(folder: Path) -> Path:
+def make_fmu3(folder: Path, **code: str) -> Path:
     """An FMI 3.0 FMU with an input of every type, named after it, and ``mode``; ``sum`` of them all, and an array ``row``.
 
-    It asks for the end after 50 s.
+    It asks for the end after 50 s. `code` as of `compile_library`.
     """
-    library = compile_library(folder / f"sum{fmpy.sharedLibraryExtension}", fmi=3)
+    library = compile_library(folder / f"sum{fmpy.sharedLibraryExtension}", fmi=3, **code)
     inputs = [
         f'\n    <{kind} name="{kind}" valueReference="{k}" causality="input" start="{"false" if kind == "Boolean" else 0}"/>'
         for k, kind in enumerate(TYPES3, 2)

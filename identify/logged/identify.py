@@ -31,6 +31,8 @@ TRIED, COLUMNS = (32, 64, 128), 384  # lags of first fits where N is not given; 
 ROOM = 0.7  # of the lags of a first fit, in which it settles
 MARGIN, SHORTEST = 1.25, 10  # N over the settling time of the first fit; least N
 SETTLED, LAGS = 0.003, 5.8  # of the largest coefficient: settled; so many lags of a first order
+SPREAD = 6.9  # median deviations from 1 % to 99 % of a normal distribution
+CLOSED = 0.85  # correlation with what disturbs the CV from which on an input tells nothing of its own
 WHITE = 0.001  # probability below which residuals are not white
 
 
@@ -241,7 +243,11 @@ def _verdict(cv: str, log: Log, name: str, excited, found: _Cv, j: int) -> PairV
     span = float(np.nanpercentile(values, 99) - np.nanpercentile(values, 1)) or float(
         np.nanmax(values) - np.nanmin(values)
     )
-    return verdict_of(cv, unit, span, name, excited, s, found.band[j], doubts)
+    # a single large transient is not what the CV does in the log
+    usual = SPREAD * float(np.nanmedian(np.abs(values - np.nanmedian(values))))
+    row = verdict_of(cv, unit, min(span, usual or span), name, excited, s, found.band[j], doubts)
+    closed = tested.feedback[j] > max(CLOSED, tested.limit) and row.verdict in ("good", "look")
+    return row._replace(verdict="bad") if closed else row
 
 
 def _unsettled(steps: np.ndarray, band: np.ndarray) -> bool:

@@ -24,6 +24,9 @@ SPIKE = 8.0  # robust standard deviations of the change from row to row from whi
 SPIKE_SHARE = 0.1  # of the range of the column, which such a jump has at least
 FROZEN = 30  # rows with exactly the same value, of a signal that changes otherwise
 RESTLESS = 0.02  # share of rows without a change up to which a signal changes otherwise
+FAR = 10.0  # ranges of an input off its median, for two rows at most: a value that it never had
+UPDATED = 3  # rows from which on a CV that changes at equal intervals only is one that is held in between
+HOUR = 3600.0  # s by which clocks are set back in autumn
 LEAST = 20  # samples
 
 
@@ -93,14 +96,14 @@ def read_log(
             raise InputError("--dt", None, expected, "--time names it where it has another name")
         notes.append(f"the file has no times: its rows were taken to be {dt:g} s apart")
         table = table._replace(stamps=dt * np.arange(rows))
-    table = _in_order(table, notes)
+    table = _in_order(_clock_put_right(table, notes), notes)
     stamps = table.stamps
     assert stamps is not None
     for name, values in table.columns.items():
         if not np.isfinite(values).any():
             raise InputError(f"column {name}", "no value in any row", "numbers")
-        if clean and name not in held:
-            table.columns[name] = _cleaned(name, values, notes)
+        if clean:
+            table.columns[name] = (_plausible if name in held else _cleaned)(name, values, notes)
     typical = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
     if dt is None:
         dt = float(f"{typical:.6g}")
@@ -110,6 +113,23 @@ def read_log(
     )
     _tell_of_intervals(stamps, typical, dt, pieces, notes)
     return _on_grid(table, pieces, typical, dt, held, hold, notes)
+
+
+def _clock_put_right(table: Table, notes: list[str]) -> Table:
+    """Times that go on one hour earlier once, as local ones do in autumn, without that hour."""
+    stamps, columns = table.stamps, list(table.columns.values())
+    assert stamps is not None
+    steps = np.diff(stamps)
+    typical = float(np.median(steps)) if len(steps) else HOUR
+    back = np.flatnonzero(np.abs(steps + HOUR - typical) <= 0.5 * typical)
+    if len(back) != 1 or not 0 < typical < HOUR / 2:
+        return table
+    k = int(back[0]) + 1
+    same = np.flatnonzero(stamps[:k] == stamps[k])
+    if len(same) and all(np.array_equal(values[k], values[same[0]], equal_nan=True) for values in columns):
+        return table  # an hour that is in the file twice
+    notes.append("the clock was set back by an hour once; the hour after was put behind the one before")
+    return table._replace(stamps=stamps + HOUR * (np.arange(len(stamps)) >= k))
 
 
 def _in_order(table: Table, notes: list[str]) -> Table:
@@ -129,6 +149,21 @@ def _in_order(table: Table, notes: list[str]) -> Table:
     return table._replace(stamps=stamps[order], columns=columns)
 
 
+def _plausible(name: str, values: np.ndarray, notes: list[str]) -> np.ndarray:
+    """An input without single values far away from all others, which count as missing."""
+    low, middle, high = np.nanpercentile(values, [1, 50, 99])
+    with np.errstate(invalid="ignore"):
+        far = (np.abs(values - middle) > FAR * (high - low)) & (high > low)
+    ends = np.append(np.flatnonzero(np.diff(far)), len(far) - 1)
+    lengths = np.diff(ends, prepend=-1)
+    far &= np.repeat(lengths <= 2, lengths)
+    if far.any():
+        notes.append(
+            f"{name}: {far.sum()} outliers (more than {FAR:g} times its range away) count as missing"
+        )
+    return np.where(far, np.nan, values)
+
+
 def _cleaned(name: str, values: np.ndarray, notes: list[str]) -> np.ndarray:
     """A CV without spikes and frozen pieces, which count as missing."""
     values = values.copy()
@@ -136,10 +171,17 @@ def _cleaned(name: str, values: np.ndarray, notes: list[str]) -> np.ndarray:
     x = values[known]
     if len(x) < LEAST:
         return values
+    if (every := _held_for(x)) > 1:
+        first = np.flatnonzero(np.diff(x))[0] % every + 1
+        notes.append(f"{name} has a new value every {every} rows only; the rows in between count as missing")
+        kept = values[known[first % every :: every]]
+        values[known] = np.nan
+        values[known[first % every :: every]] = kept
+        return values
     changes = np.abs(np.diff(x))
-    limit = max(
-        SPIKE * 1.4826 * np.median(changes), SPIKE_SHARE * float(np.diff(np.percentile(x, [1, 99]))[0])
-    )
+    moves = changes[changes > 0]  # a frozen piece says nothing of what is usual
+    usual = 1.4826 * np.median(moves if len(moves) > LEAST else changes)
+    limit = max(SPIKE * usual, SPIKE_SHARE * float(np.diff(np.percentile(x, [1, 99]))[0]))
     spikes = np.zeros(len(x), bool)
     for width in (1, 2):  # rows that stay together away from both neighbours, which agree with each other
         before, after = x[: -width - 1], x[width + 1 :]
@@ -160,13 +202,23 @@ def _cleaned(name: str, values: np.ndarray, notes: list[str]) -> np.ndarray:
     return values
 
 
+def _held_for(x: np.ndarray) -> int:
+    """For how many rows a signal is held, if it changes at equal intervals only; else 1."""
+    changes = np.flatnonzero(np.diff(x))
+    apart = np.diff(changes)
+    if len(apart) < LEAST or (every := int(np.median(apart))) < UPDATED or (apart % every).any():
+        return 1
+    return every if (apart == every).mean() > 0.5 else 1
+
+
 def _frozen(x: np.ndarray) -> np.ndarray:
     """Long runs of one value after the first, of a signal that hardly ever repeats a value elsewhere."""
     ends = np.append(np.flatnonzero(np.diff(x) != 0), len(x) - 1)
     lengths = np.diff(ends, prepend=-1)
     long = lengths >= FROZEN
     long[0] = False  # a plant at rest before the first test
-    repeats = (lengths[~long] - 1).sum() / max(1, lengths[~long].sum())
+    others = lengths[1:][~long[1:]]
+    repeats = (others - 1).sum() / max(1, others.sum())
     return np.repeat(long & (repeats <= RESTLESS), lengths)
 
 

@@ -67,12 +67,15 @@ def read_table(path: str | Path, names: Sequence[str], time: str | None) -> Tabl
         InputError: for a file that cannot be read, a missing column, or a text that is no number, with its column and row.
     """
     parquet = Path(path).suffix.lower() == ".parquet"
-    heads, rows, first = _parquet(path) if parquet else _csv(path)
+    heads, rows, first = _parquet(path) if parquet else _csv(path, names)
     places, units = _places(heads, names)
-    at = _time_column(heads, places, time)
+    dated = [k for k, column in enumerate(rows) if getattr(column, "dtype", np.dtype("O")).kind == "M"]
+    at = _time_column(heads, places, time, dated)
     decimal, unit_row, notes = False, False, []
     if not parquet:
         decimal = first[1]
+        if first[0] > 2:
+            notes.append(f"{first[0] - 2} lines above the names were passed over")
         unit_row = bool(rows[0]) and _is_unit_row([rows[places[name]][0] for name in names], decimal)
         if unit_row:
             units |= {name: str(rows[places[name]][0]).strip() for name in names}
@@ -88,10 +91,13 @@ def read_table(path: str | Path, names: Sequence[str], time: str | None) -> Tabl
     if at is not None and len(rows[at]):
         stamps, said = seconds(heads[at], rows[at], line, decimal)
         begin, notes = str(rows[at][0]).strip(), [*notes, *said]
+        if len(stamps) > 1 and not np.ptp(stamps):
+            expected = "times that go on; where date and time are two columns, make one of them"
+            raise InputError(f"column {heads[at]}", begin, expected)
     return Table(stamps, begin, columns, {k: v for k, v in units.items() if v}, tuple(notes))
 
 
-def _csv(path: str | Path) -> tuple[list[str], list[list[str]], tuple[int, bool]]:
+def _csv(path: str | Path, names: Sequence[str]) -> tuple[list[str], list[list[str]], tuple[int, bool]]:
     """Names, columns of texts, and ``(line of the first row, whether commas are decimal)``."""
     try:
         raw = Path(path).read_bytes()
@@ -101,19 +107,22 @@ def _csv(path: str | Path) -> tuple[list[str], list[list[str]], tuple[int, bool]
     lines = [line for line in text.splitlines()[:50] if line.strip()]
     if not lines:
         raise InputError("data", str(path), "a row of names and rows of values; the file is empty")
-    separator = max(";\t,|", key=lambda mark: (lines[0].count(mark), mark == ";"))
+    head = next((line for line in lines if all(name in line for name in names)), lines[0])
+    above = text.index(head)
+    skipped, text = text[:above].count("\n"), text[above:]
+    separator = max(";\t,|", key=lambda mark: (head.count(mark), mark == ";"))
     table = [row for row in csv.reader(io.StringIO(text), delimiter=separator) if any(map(str.strip, row))]
     heads = [name.strip().lstrip("\ufeff") for name in table[0]]
     while heads and not heads[-1]:
         heads.pop()
-    for k, row in enumerate(table[1:], start=2):
+    for k, row in enumerate(table[1:], start=2 + skipped):
         if len(row) < len(heads):
             raise InputError(f"row {k}", separator.join(row), f"{len(heads)} values, one per name")
     columns = [list(column) for column in zip(*(row[: len(heads)] for row in table[1:]), strict=True)]
     columns = columns or [[] for _ in heads]
     sample = [text.strip() for column in columns for text in column[:200]]
     decimal = separator != "," and any("," in t and GROUPED.match(t) for t in sample)
-    return heads, columns, (2, decimal)
+    return heads, columns, (2 + skipped, decimal)
 
 
 def _decoded(raw: bytes) -> str:
@@ -138,7 +147,8 @@ def _parquet(path: str | Path) -> tuple[list[str], list[Any], tuple[int, bool]]:
     columns = []
     for column in table.columns:
         values = column.to_pandas() if hasattr(column, "to_pandas") else column.to_pylist()
-        columns.append(np.asarray(values))
+        zoned = getattr(getattr(values, "dtype", None), "tz", None) is not None
+        columns.append(np.asarray(values, dtype="datetime64[ns]" if zoned else None))  # in UTC
     return [str(name) for name in table.column_names], columns, (1, False)
 
 
@@ -161,15 +171,18 @@ def _places(heads: Sequence[str], names: Sequence[str]) -> tuple[dict[str, int],
     return {name: known[name][0][0] for name in names}, {name: known[name][0][1] for name in names}
 
 
-def _time_column(heads: Sequence[str], places: dict[str, int], time: str | None) -> int | None:
+def _time_column(
+    heads: Sequence[str], places: dict[str, int], time: str | None, dated: Sequence[int]
+) -> int | None:
     if time is not None:
         found, _ = _places(heads, [time])
         if found[time] in places.values():
             raise InputError("--time", time, "a column that is no MV, CV or DV")
         return found[time]
-    named = re.compile(r"(date|time|stamp|zeit|datum|uhrzeit|t)\b|.*(time|stamp)$", re.IGNORECASE)
+    named = re.compile(r"(date|time|stamp|zeit|datum|uhrzeit|ts|t)\b|.*(time|stamp)$", re.IGNORECASE)
     free = [k for k in range(len(heads)) if k not in places.values()]
-    return next((k for k in free if k == 0 or named.match(heads[k])), None)
+    likely = [k for k in dated if k in free] or [k for k in free if k == 0 or named.match(heads[k])]
+    return next(iter(likely), None)
 
 
 def _is_unit_row(texts: Iterable[str], decimal: bool) -> bool:

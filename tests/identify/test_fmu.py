@@ -296,3 +296,10 @@ def test_fmu_info_of_what_is_no_fmu_ends_with_status_two_and_one_line(tmp_path, 
     assert out == ""
     assert error.startswith("jaxmpc: FMU: got")
     assert error.count("\n") == 1
+
+
+def test_a_step_of_fmi_3_that_returns_early_is_gone_on_with(tmp_path):
+    path = fmus.make_fmu3(tmp_path, do_step="if (h > 0.3) { h = 0.2; *early = true; } x[40] += h")
+    with FmuPlant(path, ["Float64"], ["sum"], dt=1.0) as plant:
+        plant.init()
+        assert plant.step([0.0]).cv[0] == pytest.approx(1.0)

@@ -110,6 +110,17 @@ def test_what_a_plant_does_besides_is_not_in_its_response(tmp_path, code, exact)
     assert off(found(plant(tmp_path, states=2, **code)), exact) < CLOSE
 
 
+@pytest.mark.parametrize(
+    ("code", "exact"),
+    [(LAG | {"initial": "x[0] = 100"}, EXACT), ({"rates": "d[0] = u[0] - 50", "outputs": "y[0] = x[0]"}, T)],
+    ids=["at rest", "integrates"],
+)
+def test_an_fmu_whose_reset_does_nothing_is_run_in_new_processes(tmp_path, code, exact):
+    got = found(plant(tmp_path, reset="return 0", **(code | {"states": 1})))
+    assert off(got, exact) < CLOSE
+    assert any("does not reset it" in note for note in got.notes)
+
+
 @pytest.mark.parametrize(("at", "way"), [(0, "up"), (100, "down")])
 def test_at_a_limit_steps_go_the_way_that_is_left(tmp_path, at, way):
     got = found(plant(tmp_path), {"u": (float(at), 2.0)})
@@ -157,6 +168,36 @@ def test_a_pair_that_is_not_simply_linear_says_so(tmp_path, code, verdict, says)
     path = plant(tmp_path, states=1, outputs="y[0] = x[0]", **code)
     row = found(path, {"u": (None, 10.0)}).verdicts[0]
     assert (row.verdict, says in row.says) == (verdict, True), row
+
+
+@pytest.mark.parametrize("kind", ["CoSimulation", "ModelExchange"])
+def test_a_response_that_is_small_beside_the_value_of_its_cv_is_found_and_to_be_looked_at(tmp_path, kind):
+    small = {"states": 1, "rates": "d[0] = (1e-6 * u[0] - x[0]) / 100", "outputs": "y[0] = x[0] + 1000"}
+    got = found(plant(tmp_path, kind=kind, **small))
+    assert off(got, EXACT / 2e6) < 1e-3  # CVode follows a change of 1e-6 in a state of 5e-5
+    assert got.verdicts[0].verdict == "look"
+    assert "of its value only" in got.verdicts[0].says
+
+
+@pytest.mark.parametrize(
+    ("tick", "verdict"),
+    [
+        ("if (fabs(u[0] - memory[0]) > 2.5) { memory[0] = u[0]; }", "bad"),
+        # so far away it fails: the tests are what they are
+        ("if (fabs(u[0] - 50) > 2.5) { abort(); }", "none"),
+    ],
+)
+def test_an_input_that_shows_nothing_is_stepped_further(tmp_path, tick, verdict):
+    sticks = {"states": 1, "initial": "memory[0] = 50", "rates": "d[0] = (2 * memory[0] - x[0]) / 100"}
+    row = found(plant(tmp_path, outputs="y[0] = x[0]", tick=tick, **sticks)).verdicts[0]
+    assert row.verdict == verdict
+    assert ("a larger one moves it by 19.9 m" in row.says) == (verdict == "bad")
+
+
+def test_a_start_value_out_of_its_range_is_refused_as_such(tmp_path):
+    path = plant(tmp_path, [real("u", 0, start=150, min=0, max=100), Y])
+    with pytest.raises(InputError, match=r"--mv u: got 150.0, expected .* from 0 to 100.* start value"):
+        found(path)
 
 
 def test_inputs_and_cvs_without_any_response_are_named(tmp_path):

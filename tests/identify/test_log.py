@@ -143,6 +143,57 @@ def test_spikes_and_frozen_pieces_are_taken_out_and_counted_but_steps_stay(tmp_p
     assert any("40 frozen" in note for note in log.notes)
 
 
+def test_a_piece_that_is_frozen_up_to_the_end_counts_as_missing_also_after_a_rest(tmp_path):
+    y = np.random.default_rng(3).normal(size=300)
+    y[:40], y[200:] = 7.0, y[200]
+    log = read_log(written(tmp_path, rows(range(300), y=y)), ["u", "y"], held=["u"])
+    assert np.flatnonzero(np.isnan(log.values["y"])).tolist() == list(range(200, 300))
+
+
+def test_a_cv_that_is_held_between_its_values_counts_where_it_is_new(tmp_path):
+    y = np.repeat(np.random.default_rng(3).normal(size=40), 10)[3:]
+    log = read_log(written(tmp_path, rows(range(397), y=y)), ["u", "y"], held=["u"])
+    assert np.flatnonzero(np.isfinite(log.values["y"])).tolist() == list(range(7, 397, 10))
+
+
+def test_a_single_value_of_an_input_far_away_from_all_others_is_held_over(tmp_path):
+    u = np.arange(300) // 20 % 3
+    u[105] = 100_000
+    log = read_log(written(tmp_path, rows(range(300), u=u)), ["u", "y"], held=["u"])
+    assert log.values["u"].max() == 2
+    assert any("u: 1 outliers" in note for note in log.notes)
+
+
+@pytest.mark.parametrize("apart", [10, 7])
+def test_an_hour_that_comes_twice_in_local_time_is_put_in_order(tmp_path, apart):
+    moments = datetime.datetime(2024, 10, 27, 2) + datetime.timedelta(seconds=apart) * np.arange(900)
+    moments[500:] -= datetime.timedelta(hours=1)
+    log = read_log(written(tmp_path, rows(moments)), ["u", "y"], held=["u"])
+    assert log.values["u"].tolist() == list(range(900))
+    assert any("set back by an hour" in note for note in log.notes)
+
+
+def test_an_hour_that_is_in_a_file_twice_is_taken_once(tmp_path):
+    moments = datetime.datetime(2024, 10, 27, 2) + datetime.timedelta(seconds=10) * np.arange(900)
+    own = [*range(500), *range(140, 900)]  # row 140 is an hour before 500
+    log = read_log(written(tmp_path, rows(moments[own], own, own)), ["u", "y"], held=["u"])
+    assert log.values["u"].tolist() == list(range(900))
+
+
+def test_lines_above_the_names_are_passed_over_and_counted(tmp_path):
+    lines = ["Export of the historian", "", *rows(range(COUNT))]
+    log = read_log(written(tmp_path, lines), ["u", "y"], held=["u"])
+    assert log.values["u"].tolist() == list(range(COUNT))
+    lines[10] = "8,off,1"
+    with pytest.raises(InputError, match="column u, row 11: got 'off'"):
+        read_log(written(tmp_path, lines), ["u", "y"])
+
+
+def test_times_that_stand_still_are_refused(tmp_path):
+    with pytest.raises(InputError, match="date and time are two columns"):
+        read_log(written(tmp_path, rows(["2024-03-01"] * COUNT)), ["u", "y"])
+
+
 def test_a_file_without_times_needs_the_interval(tmp_path):
     lines = ["u,y", *(f"{k},{2 * k}" for k in range(COUNT))]
     path = written(tmp_path, lines)
@@ -151,10 +202,12 @@ def test_a_file_without_times_needs_the_interval(tmp_path):
     assert read_log(path, ["u", "y"], 4.0).times[1] == 4.0
 
 
-def test_parquet_and_csv_are_read_alike(tmp_path):
+@pytest.mark.parametrize("zone", [None, "Europe/Oslo"])
+def test_parquet_and_csv_are_read_alike(tmp_path, zone):
     pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
     y = [None if k == 7 else 2.0 * k for k in range(COUNT)]
-    table = pyarrow.table({"when": MOMENTS, "u": list(range(COUNT)), "y": y})
+    when = pyarrow.array(MOMENTS, pyarrow.timestamp("us", zone))  # last, as pandas writes an index
+    table = pyarrow.table({"u": list(range(COUNT)), "y": y, "__index_level_0__": when})
     parquet.write_table(table, tmp_path / "log.parquet")
     log = read_log(tmp_path / "log.parquet", ["u", "y"], held=["u"])
     assert log.dt == 10.0

@@ -259,6 +259,26 @@ def test_a_loop_that_was_closed_is_recognised(tmp_path):
     assert any("closed the loop" in note for note in found.notes)
 
 
+def test_an_input_that_a_controller_moves_by_the_disturbance_alone_tells_nothing(tmp_path):
+    rng = np.random.default_rng(2)
+    drift, noise = 0.05 * rng.normal(size=COUNT).cumsum(), 0.05 * rng.normal(size=COUNT)
+    u, y, x, total = np.zeros(COUNT), drift + noise, 0.0, 0.0
+    for t in range(COUNT):
+        y[t] += x
+        total -= 0.02 * y[t]
+        u[t] = total - 0.3 * y[t]
+        x += (1.2 * u[t] - x) / 6
+    with pytest.raises(InputError, match="feedback"):
+        identify_log(log_file(tmp_path / "log.csv", u[:, None], y), ["a"], ["y"], samples=LENGTH)
+
+
+def test_a_large_transient_does_not_make_a_response_of_nothing(tmp_path, moves):
+    y = response(FIRST, moves[:, 0]) + response(SECOND, moves[:, 1])
+    y[:20] += 5000
+    with pytest.raises(InputError, match="cannot tell"):
+        identify_log(log_file(tmp_path / "log.csv", moves, y), ["a", "b"], ["y"], samples=LENGTH)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
