@@ -39,6 +39,7 @@ DOORS = {
         "studies/definition/axes.py",
     ),
     "clarabel": ("jaxmpc/integer/tighten.py", "studies/bench/peers.py"),
+    "sippy_unipi": ("studies/bench/sections/identification.py",),
     **dict.fromkeys(("piqp", "osqp", "daqp", "qpax", "pyscipopt", "gurobipy"), ("studies/bench/peers.py",)),
 }
 COLUMN = (

@@ -1,12 +1,16 @@
-"""Step responses from noisy data whose truth is known: ours beside ordinary least squares of FIR and ARX models."""
+"""Step responses from noisy data whose truth is known: ours beside the FIR and ARX models of SIPPY."""
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import time
 from collections.abc import Callable, Iterator
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
+from scipy.signal import lfilter
 
 from identify.logged.fit import make_data, search
 from jaxmpc.model.transfer_function import TransferFunction
@@ -29,6 +33,10 @@ def identification(context: Context) -> Iterator[Row]:
         logs = [_log(kind, seed) for seed in range(context.size.identified)]
         context.say(f"identification, {kind}")
         for name, method in METHODS.items():
+            row = f"identification, {kind}: {name}"
+            if method is not _kernel and importlib.util.find_spec("sippy_unipi") is None:
+                yield Row(name=row, status="missing", note="pip install 'jaxmpc[bench]'")
+                continue
             times, errors = [], []
             for truth, y, u in logs:
                 begin = time.perf_counter()
@@ -38,7 +46,7 @@ def identification(context: Context) -> Iterator[Row]:
             note = (
                 f"error of the worst coefficient, median {np.median(errors):.2g}; {COUNT} samples, N {LENGTH}"
             )
-            yield timed(f"identification, {kind}: {name}", times, errors, solved=None, counts=True, note=note)
+            yield timed(row, times, errors, solved=None, counts=True, note=note)
 
 
 def _log(kind: str, seed: int) -> tuple[Float[np.ndarray, "input n"], Float[np.ndarray, " sample"], Signals]:
@@ -69,30 +77,20 @@ def _kernel(y: np.ndarray, u: Signals) -> Float[np.ndarray, "input n"]:
     return search(data, LENGTH).steps(data)
 
 
-def _past(signals: np.ndarray, lags: int) -> np.ndarray:
-    """Columns of the last `lags` values of each signal, those before the first one held."""
-    at = np.maximum(np.arange(len(signals))[:, None] - np.arange(1, lags + 1), 0)
-    return np.concatenate([column[at] for column in signals.T], axis=1)
+def _sippy(kind: Literal["FIR", "ARX"]) -> Method:
+    """Least squares by SIPPY: of a finite impulse response, or of an ARX model whose lags cover dead times up to 8."""
+
+    def method(y: np.ndarray, u: Signals) -> Float[np.ndarray, "input n"]:
+        identify = importlib.import_module("sippy_unipi").system_identification
+        orders: dict[str, Any] = {"FIR_orders": [LENGTH, 0], "ARX_orders": [ORDER, ORDER + 8, 0]}
+        signals = (y - y.mean())[None], (u - u.mean(axis=0)).T
+        found = identify(*signals, kind, **{f"{kind}_orders": orders[f"{kind}_orders"]})
+        pulse = np.eye(1, LENGTH + 1)[0]
+        of_inputs = zip(found.NUMERATOR[0], found.DENOMINATOR[0], strict=True)
+        responses = [lfilter([0.0, *numerator], denominator, pulse) for numerator, denominator in of_inputs]
+        return np.cumsum(responses, axis=1)[:, 1:]
+
+    return method
 
 
-def _finite(y: np.ndarray, u: Signals) -> Float[np.ndarray, "input n"]:
-    """Ordinary least squares of a finite impulse response and an offset."""
-    columns = np.column_stack([_past(u, LENGTH), np.ones(COUNT)])
-    found = np.linalg.lstsq(columns, y, rcond=None)[0]
-    return np.cumsum(found[:-1].reshape(u.shape[1], LENGTH), axis=1)
-
-
-def _arx(y: np.ndarray, u: Signals) -> Float[np.ndarray, "input n"]:
-    """Ordinary least squares of an ARX model whose dead times (up to 8) are covered by 8 further lags of the inputs."""
-    lags = ORDER + 8
-    columns = np.column_stack([_past(y[:, None], ORDER), _past(u, lags), np.ones(COUNT)])[lags:]
-    found = np.linalg.lstsq(columns, y[lags:], rcond=None)[0]
-    own, of_inputs = found[:ORDER], found[ORDER:-1].reshape(u.shape[1], lags)
-    steps = np.zeros((u.shape[1], LENGTH))
-    for t in range(LENGTH):
-        before = steps[:, max(t - ORDER, 0) : t][:, ::-1]
-        steps[:, t] = before @ own[: before.shape[1]] + of_inputs[:, : t + 1].sum(axis=1)
-    return steps
-
-
-METHODS: dict[str, Method] = {"jaxmpc": _kernel, "FIR least squares": _finite, "ARX least squares": _arx}
+METHODS: dict[str, Method] = {"jaxmpc": _kernel, "SIPPY, FIR": _sippy("FIR"), "SIPPY, ARX": _sippy("ARX")}
