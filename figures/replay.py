@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 
 from figures import panels, style
 from figures.figure import FigureEntry
-from studies.kpi.replay import predicted, summary
 from studies.plans import begins
+from studies.replay import predicted, summary
 
 STUDY = "replay"
 

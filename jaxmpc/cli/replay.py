@@ -29,7 +29,7 @@ def replay(options: Options) -> int:
     check_folder("--out", options.out)
     from jaxmpc.process.file import load_process
     from jaxmpc.programs.compilation import is_quiet
-    from studies.kpi.replay import write_summary
+    from studies.replay import write_summary
     from studies.run.replay import run_replay
 
     folder = run_replay(

@@ -13,8 +13,8 @@ from jaxmpc.files import toml_text
 from jaxmpc.loop.replay import Done, replay
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.process.file import process_of
-from studies.kpi.replay import predicted
 from studies.plans import plan_at
+from studies.replay import predicted
 from studies.run.replay import ADVICE, run_replay
 from studies.store.reading import open_results
 
