@@ -44,7 +44,7 @@ def write_page(found: Identification, path: str | Path) -> Path:
         InputError: for a page of more than 10 MB, before anything is written.
     """
     model = found.model
-    inputs = ", ".join((*model.mv_names, *model.dv_names))
+    inputs = ", ".join(model.input_names)
     sections = [
         ("verdicts", "Verdicts", _verdicts(found)),
         ("next", "What to do next", _listed(found.advice)),
@@ -104,15 +104,8 @@ def _axis(times: np.ndarray) -> tuple[np.ndarray, str]:
 def _channels(found: Identification) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
     """Names and units of the inputs, and of the CVs."""
     model = found.model
-    mvs, dvs, cvs = (
-        list(zip(names, units or ("1",) * len(names), strict=True))
-        for names, units in (
-            (model.mv_names, model.mv_units),
-            (model.dv_names, model.dv_units),
-            (model.cv_names, model.cv_units),
-        )
-    )
-    return mvs + dvs, cvs
+    inputs, cvs = ([(name, model.units[name]) for name in own] for own in (model.input_names, model.cv_names))
+    return inputs, cvs
 
 
 @style.house_style
@@ -192,7 +185,7 @@ def _stretches(flags: np.ndarray) -> list[tuple[int, int]]:
 
 def _origin(found: Identification) -> str:
     model = found.model
-    units = dict(zip((*model.cv_names, *model.mv_names), (*model.cv_units, *model.mv_units), strict=False))
+    units = model.units
     rows = [
         [f"{name} at the working point", f"{html.number(value)} {units.get(name, '')}".removesuffix(" 1")]
         for name, value in model.working_point

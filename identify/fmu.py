@@ -38,6 +38,11 @@ def validate_fmu(path: str | Path) -> list[str]:
     return list(validate(str(path)))
 
 
+def fmu_digest(path: str | Path) -> str:
+    """Of the content of an FMU."""
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+
+
 class FmuPlant:
     """An FMU as a plant that keeps its state, in a process of its own.
 

@@ -1,4 +1,4 @@
-"""The inputs of an FMU in step tests: where they stand, which steps they can make, what a process file may call them.
+"""The inputs of an FMU in step tests: where they stand, and which steps they can make.
 
 `identify.fmu_steps` makes the steps. Only values that an input can have are stepped to: within its range, whole where it is.
 """
@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -168,17 +167,3 @@ def actuator_of(v: FmuVariable) -> dict[str, Any] | None:
     if v.type == "Enumeration":
         return {"kind": "values", "values": sorted(v.items.values())}
     return {"kind": "stepped", "step": 1.0} if v.type in BITS else None
-
-
-def legal_names(names: Sequence[str]) -> dict[str, str]:
-    """Names that a process file may have, by those of an FMU: ``tank[1].level`` as ``tank_1_level``."""
-    out: dict[str, str] = {}
-    for name in names:
-        plain = "_".join(re.findall(r"[A-Za-z0-9]+", name)) if re.search(r"\W", name, re.ASCII) else name
-        plain = (plain if plain[:1].isalpha() else f"v_{plain.strip('_')}")[:60]
-        own, k = plain, 1
-        while own in out.values() or (own != name and own in names):
-            k += 1
-            own = f"{plain}_{k}"
-        out[name] = own
-    return out

@@ -9,20 +9,21 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import hashlib
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from identify.fmu import FmuPlant
+from identify.fmu import FmuPlant, fmu_digest
 from identify.fmu_description import BITS, REALS, FmuDescription, Value
-from identify.fmu_inputs import WAYS, Moved, actuator_of, error_of, further, legal_names, moved, repeats
+from identify.fmu_inputs import WAYS, Moved, actuator_of, error_of, further, moved, repeats
 from identify.fmu_process import TIME_LIMIT, FmuProcess
 from identify.fmu_verdicts import NOTHING, Tests, advice_of, judged, movement_of
+from identify.names import legal_names
 from identify.step_test import SETTLE_SAMPLES
 from jaxmpc.check import is_count, is_number
 from jaxmpc.controller.schedule import ModelSchedule, make_schedule
@@ -271,7 +272,8 @@ class _Tests:
             pairs = np.stack([responses["up"], responses["down"]])
             mean = np.where(np.isnan(pairs).any(axis=0), np.nansum(pairs, axis=0), pairs.mean(axis=0))
         point = base.mean(axis=0) if noise.any() else base[0]
-        model = self._model(mean, point, settle, {})
+        facts = self._facts(settle)
+        model = self._model(mean, point, facts)
         scale = np.maximum(scale, changes.max(axis=1))
         more = self._further(settle, (changes <= NOTHING * scale[:, None]) & (noise == 0)[:, None], base)
         whole = [v.type in REALS for v in self.cv_variables]
@@ -282,7 +284,7 @@ class _Tests:
         mean[silent] = 0.0
         told = {"settled": not any("not settled" in row.says for row in verdicts)}
         told |= {"verdicts": [list(row) for row in verdicts], "notes": list(notes)}
-        model = self._model(mean, point, settle, told)
+        model = self._model(mean, point, facts | told)
         return Identification(
             model,
             verdicts,
@@ -330,18 +332,16 @@ class _Tests:
 
     # ------------------------------------------------------------------------------------------------- what is returned
 
-    def _model(self, mean: np.ndarray, settled: np.ndarray, settle: float, told: dict) -> StepResponseModel:
+    def _facts(self, settle: float) -> dict[str, Any]:
+        """What the model is identified from."""
         path = self.path.resolve()
-        units = [one.variable.unit or "1" for one in self.inputs]
-        names = [one.channel for one in self.inputs]
-        point = dict(zip((*names, *self.cvs), (*self.rest.tolist(), *settled.tolist()), strict=True))
         own = {one.variable.name: one.rest for one in self.inputs[self.count :]}
-        facts = {
+        return {
             "plant": "fmu",
             "plant_hash": self.plant_of(settle).facts()["hash"],
             "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "fmu": str(path),
-            "fmu_hash": hashlib.sha256(path.read_bytes()).hexdigest(),
+            "fmu_hash": fmu_digest(path),
             "variables": self.renamed,
             "start": self.start | {n: self.description.variable("", n).nearest(x) for n, x in own.items()},
             "settle": settle,
@@ -359,11 +359,16 @@ class _Tests:
                 one.channel: how for one in self.inputs[: self.count] if (how := actuator_of(one.variable))
             },
         }
+
+    def _model(self, mean: np.ndarray, settled: np.ndarray, facts: dict[str, Any]) -> StepResponseModel:
+        units = [one.variable.unit or "1" for one in self.inputs]
+        names = [one.channel for one in self.inputs]
+        point = dict(zip((*names, *self.cvs), (*self.rest.tolist(), *settled.tolist()), strict=True))
         count = self.count
         return make_model(
             mean[:, :count], self.dt, self.cvs, names[:count],
             cv_units=[v.unit or "1" for v in self.cv_variables], mv_units=units[:count],
-            working_point=point, provenance=facts | told,
+            working_point=point, provenance=facts,
             dv_coefficients=mean[:, count:], dv_names=names[count:], dv_units=units[count:],
         )  # fmt: skip
 

@@ -90,8 +90,8 @@ def _smoothed(tests: Tests) -> StepResponseModel:
 
 def _pair(tests: Tests, i: int, j: int, row: Settling) -> tuple[Verdict, str]:
     model = tests.model
-    s = np.concatenate([np.asarray(model.coefficients), np.asarray(model.dv_coefficients)], axis=1)[i, j]
-    cv_unit, unit = model.cv_units[i], (*model.mv_units, *model.dv_units)[j]
+    s = model.responses[i, j]
+    cv_unit, unit = (model.units[names[k]] for names, k in ((model.cv_names, i), (model.input_names, j)))
     per = "" if cv_unit == unit == "1" else f" {cv_unit} per {unit}".replace(" 1 per", " per")
     tested = np.stack([found[i, j] for found in tests.responses.values() if np.isfinite(found[i, j]).all()])
     error, peak = float(tests.errors[i, j]), float(np.abs(tested).max())

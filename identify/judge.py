@@ -60,9 +60,9 @@ def _spans(process: Process) -> np.ndarray:
 
 def _pairs(process: Process, model: StepResponseModel) -> list[Finding]:
     out: list[Finding] = []
-    s = np.concatenate([np.asarray(model.coefficients), np.asarray(model.dv_coefficients)], axis=1)
+    s = model.responses
     inputs = {v.name: v for v in (*process.mvs, *process.disturbances)}
-    places = {name: j for j, name in enumerate((*model.mv_names, *model.dv_names))}
+    places = {name: j for j, name in enumerate(model.input_names)}
     for row in settling(model):
         i, j = process.cv_names.index(row.cv), places[row.mv]
         cv, mv, subject = process.cvs[i], inputs[row.mv], f"{row.mv} on {row.cv}"

@@ -52,9 +52,8 @@ class Settling(NamedTuple):
 def settling(model: StepResponseModel) -> list[Settling]:
     """Whether each response of a model had settled by its last sample; see `Settling`."""
     found = []
-    inputs = (*model.mv_names, *model.dv_names)
-    responses = np.concatenate([model.coefficients, model.dv_coefficients], axis=1)
-    for (i, cv), (j, mv) in itertools.product(enumerate(model.cv_names), enumerate(inputs)):
+    responses = model.responses
+    for (i, cv), (j, mv) in itertools.product(enumerate(model.cv_names), enumerate(model.input_names)):
         s = responses[i, j]
         gain, peak = float(s[-1]), float(s[np.argmax(np.abs(s))])
         tail = s[-max(2, len(s) // 10) :]

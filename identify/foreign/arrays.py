@@ -18,9 +18,7 @@ from identify.foreign.common import (
     assemble,
     first_entry_of,
     foreign_names,
-    full_responses,
     shifted,
-    units_of,
 )
 from jaxmpc.check import is_number, require, sound
 from jaxmpc.errors import InputError
@@ -107,7 +105,7 @@ def _array(path: Path, held: dict[str, Any], key: str) -> np.ndarray:
 
 def write(model: StepResponseModel, path: Path, asked: Asked) -> tuple[list[Path], list[str]]:
     """An ``.npz`` with everything but working point and provenance."""
-    names, units, responses = foreign_names(model), units_of(model), full_responses(model)
+    names, units, responses = foreign_names(model), model.units, model.responses
     if asked.first_entry == 0:
         responses = np.concatenate([np.zeros_like(responses[..., :1]), responses], axis=2)
     mvs = len(model.mv_names)

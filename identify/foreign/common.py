@@ -9,7 +9,6 @@ import csv
 import dataclasses
 import math
 import re
-import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -17,11 +16,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from identify.names import legal_names
 from jaxmpc.check import LARGEST, is_count, is_number, require
 from jaxmpc.errors import InputError, near
 from jaxmpc.model.step_response import StepResponseModel, make_model
 
-LONGEST_NAME = 64
 LONGEST = 100_000  # coefficients of a response, beyond which a number cannot be meant
 TIME_UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
@@ -240,7 +239,8 @@ def assemble(found: Pairs, asked: Asked, origin: str) -> Imported:
     twice = next((name for name in own if own.count(name) > 1), None)
     if twice is not None:
         raise InputError("model", twice, "a name of its own for every CV, MV and DV")
-    names, renamed = identifiers(own)
+    names = legal_names(own)
+    renamed = {old: new for old, new in names.items() if old != new}
     notes += [f"renamed: {old!r} is {new}" for old, new in renamed.items()]
     mvs, unit = len(found.mvs), lambda own: tuple(found.units.get(name, "") or "1" for name in own)
     told = bool(found.units)
@@ -263,24 +263,10 @@ def assemble(found: Pairs, asked: Asked, origin: str) -> Imported:
     return Imported(model, tuple(notes))
 
 
-def identifiers(names: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
-    """Names that a process may have, by the ones that a file has, all distinct; and those that changed."""
-    out: dict[str, str] = {}
-    for name in names:
-        plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
-        plain = re.sub(r"[^A-Za-z0-9_]+", "_", plain).strip("_") or "variable"
-        plain = (plain if plain[0].isalpha() else f"v_{plain}")[:LONGEST_NAME]
-        unique, k = plain, 2
-        while unique in out.values():
-            unique, k = f"{plain[: LONGEST_NAME - 4]}_{k}", k + 1
-        out[name] = unique
-    return out, {old: new for old, new in out.items() if old != new}
-
-
 def foreign_names(model: StepResponseModel) -> dict[str, str]:
     """Names as the file of the model had them, by ours."""
     known = dict(dict(model.provenance).get("names", ()))
-    return {name: known.get(name, name) for name in (*model.cv_names, *model.mv_names, *model.dv_names)}
+    return {name: known.get(name, name) for name in (*model.cv_names, *model.input_names)}
 
 
 def single_words(model: StepResponseModel) -> dict[str, str]:
@@ -290,23 +276,9 @@ def single_words(model: StepResponseModel) -> dict[str, str]:
     }
 
 
-def units_of(model: StepResponseModel) -> dict[str, str]:
-    """Units by name; 1 where the model has none."""
-    out: dict[str, str] = {}
-    for kind in ("cv", "mv", "dv"):
-        names, units = getattr(model, f"{kind}_names"), getattr(model, f"{kind}_units")
-        out |= dict(zip(names, units or ("1",) * len(names), strict=True))
-    return out
-
-
 def chosen(option: str, asked: Sequence[str], known: Iterable[str]) -> None:
     """Refuse names of an option that the file does not have."""
     known = list(known)
     for name in asked:
         if name not in known:
             raise InputError(option, name, f"one of {', '.join(known)}", near(name, known))
-
-
-def full_responses(model: StepResponseModel) -> Float[np.ndarray, "cv input n"]:
-    """Coefficients of the MVs, then of the DVs."""
-    return np.concatenate([np.asarray(model.coefficients), np.asarray(model.dv_coefficients)], axis=1)

@@ -22,7 +22,6 @@ from identify.foreign.common import (
     foreign_names,
     number,
     shifted,
-    units_of,
 )
 from jaxmpc.check import require
 from jaxmpc.errors import InputError
@@ -119,7 +118,7 @@ def write(model: StepResponseModel, path: Path, asked: Asked) -> tuple[list[Path
     """A system file; returns it and what it cannot say."""
     if asked.first_entry == 0:
         raise InputError("--first-entry", 0, "1: files of Light-weight-MPC begin with S(1)")
-    names, units, point = foreign_names(model), units_of(model), dict(model.working_point)
+    names, units, point = foreign_names(model), model.units, dict(model.working_point)
     rows = np.asarray(model.coefficients).tolist()
 
     def told(name: str) -> dict[str, Any]:

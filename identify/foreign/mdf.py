@@ -22,12 +22,10 @@ from identify.foreign.common import (
     assemble,
     chosen,
     first_entry_of,
-    full_responses,
     number,
     read_text,
     shifted,
     single_words,
-    units_of,
 )
 from jaxmpc.check import require
 from jaxmpc.errors import InputError, near
@@ -229,11 +227,11 @@ def write(model: StepResponseModel, folder: Path, asked: Asked) -> tuple[list[Pa
         The files and what was assumed or left out.
     """
     refuse_occupied(folder)
-    names, units, responses = single_words(model), units_of(model), full_responses(model)
+    names, units, responses = single_words(model), model.units, model.responses
     first = 0 if asked.first_entry is None else asked.first_entry
     out, silent = [], []
     for i, cv in enumerate(model.cv_names):
-        for j, of in enumerate((*model.mv_names, *model.dv_names)):
+        for j, of in enumerate(model.input_names):
             values = responses[i, j]
             if not values.any():
                 silent.append(f"{of} on {cv}")

@@ -25,11 +25,9 @@ from identify.foreign.common import (
     csv_rows,
     first_entry_of,
     foreign_names,
-    full_responses,
     number,
     read_text,
     shifted,
-    units_of,
 )
 from jaxmpc.check import is_number, require
 from jaxmpc.errors import InputError
@@ -212,8 +210,8 @@ def write(model: StepResponseModel, path: Path, asked: Asked) -> tuple[list[Path
     """An export as NeqSim writes it: JSON, or CSV where the name of the file says so; returns it and what it cannot say."""
     if asked.first_entry == 1:
         raise InputError("--first-entry", 1, "0: exports of NeqSim begin with S(0), at time 0")
-    names, units, point = foreign_names(model), units_of(model), dict(model.working_point)
-    inputs, responses = (*model.mv_names, *model.dv_names), full_responses(model)
+    names, units, point = foreign_names(model), model.units, dict(model.working_point)
+    inputs, responses = model.input_names, model.responses
     whole = np.concatenate([np.zeros_like(responses[..., :1]), responses], axis=2)
     if path.suffix.lower() == ".csv":
         listed = [(i, j) for i in range(len(model.cv_names)) for j in range(len(inputs))]

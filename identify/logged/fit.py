@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from identify.logged.kernel import Posterior, estimate
 from identify.logged.noise import WALK, WHITE, Noise, likeliest
-from identify.logged.regression import Segment, predicted, sums, tents
+from identify.logged.regression import Segment, free_columns, predicted, sums
 
 ROUNDS = 2  # of noise models estimated from residuals
 GAIN = 6.0  # by which twice a log-likelihood must improve for a model with more in it
@@ -156,12 +156,7 @@ def residuals(data: Data, fit: Fit) -> list[Float[np.ndarray, " sample"]]:
     for part in data.parts(fit.integrating):
         left = part.output - predicted(fit.posterior.mean, part.inputs)
         known = np.isfinite(left)
-        columns = [np.ones((len(left), 1))]
-        if fit.integrating:
-            columns.append(np.linspace(-1, 1, len(left))[:, None])
-        if fit.free is not None:
-            columns.append(tents(len(left), length))
-        own = np.concatenate(columns, axis=1)
+        own, _ = free_columns(len(left), length, fit.free, slope=fit.integrating)
         if known.any():
             left = left - own @ np.linalg.lstsq(own[known], left[known], rcond=None)[0]
         out.append(left)

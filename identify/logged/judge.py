@@ -36,6 +36,14 @@ class Excitation(NamedTuple):
     other: str
 
     @property
+    def twin(self) -> str:
+        """Words for an input that moves like another; empty for one that does not."""
+        if self.alike <= COLLINEAR:
+            return ""
+        share = f"{100 * self.alike:.3g} % of its variance"
+        return f"moves like {self.other} ({share}): the data cannot tell which of the two acts"
+
+    @property
     def small(self) -> bool:
         """Whether its moves are small for an input of its kind."""
         return self.moved < TOO_SMALL * (100.0 if self.unit == "%" else abs(self.level))
@@ -87,9 +95,8 @@ def verdict_of(
         return PairVerdict(cv, name, "bad", f"{name} never moves in the log: step it, or leave it out")
     peak, half = float(np.abs(steps).max()), float(band.max())
     span = amount(excited.moved, excited.unit)
-    if excited.alike > COLLINEAR:
-        words = f"{name} moves like {excited.other} ({100 * excited.alike:.3g} % of its variance): the data cannot tell "
-        return PairVerdict(cv, name, "bad", words + "which of the two acts; move one without the other")
+    if excited.twin:
+        return PairVerdict(cv, name, "bad", f"{name} {excited.twin}; move one without the other")
     if (peak + half) * excited.moved <= HARDLY * cv_range and not excited.small:
         words = f"no response: moves of {span} change {cv} by {amount((peak + half) * excited.moved, cv_unit)} at most"
         return PairVerdict(cv, name, "none", words)

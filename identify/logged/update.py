@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from identify.logged.fit import WIDER
 from identify.logged.identify import HELD_OUT, WHITE
-from identify.logged.judge import COLLINEAR, GOOD, USABLE, excitations
+from identify.logged.judge import GOOD, USABLE, excitations
 from identify.logged.knobs import GAIN, Case, Found, fit_knobs
 from identify.logged.log import Log, read_log
 from identify.logged.noise import innovations
@@ -73,8 +73,7 @@ def update_model(
     log = read_log(path, [*tags.inputs, *tags.cv], process.dt, time, held=tags.inputs)
     longest = max(own.stop - own.start for own in log.segments)
     inputs = np.stack([log.values[name] for name in tags.inputs], axis=1)
-    nominal = np.concatenate([np.asarray(model.coefficients), np.asarray(model.dv_coefficients)], axis=1)
-    names = (*model.mv_names, *model.dv_names)
+    nominal, names = model.responses, model.input_names
     units = (*(mv.unit for mv in process.mvs), *(process.units.get(name, "1") for name in model.dv_names))
     excited = excitations(names, units, inputs, log.segments)
     cut = round((1 - HELD_OUT) * len(log.times))
@@ -112,9 +111,7 @@ def update_model(
 def _updated(
     nominal: np.ndarray, output: np.ndarray, inputs: np.ndarray, log: Log, cut: int, bar: tqdm
 ) -> _Cv:
-    moved = inputs - np.concatenate(
-        [np.repeat(inputs[own][:1], own.stop - own.start, axis=0) for own in log.segments]
-    )
+    moved = np.concatenate([inputs[own] - inputs[own][:1] for own in log.segments])
     acts = (np.abs(nominal).max(axis=1) > 0) & (np.abs(moved).max(axis=0) > 0)
     places = np.flatnonzero(acts)
     known, least = np.isfinite(output), ROWS * max(places.size, 1)
@@ -159,9 +156,8 @@ def _verdict(cv: str, name: str, nominal: np.ndarray, excited, own: _Cv, j: int,
     at = int(np.flatnonzero(own.places == j)[0])
     (gain, delay, scale), deviation = own.found.x[at], own.found.deviations[at]
     half = HALF * deviation
-    if excited.alike > COLLINEAR:
-        words = f"{name} moves like {excited.other} ({100 * excited.alike:.3g} % of its variance)"
-        return PairVerdict(cv, name, "bad", f"{words}: the data cannot tell which of the two acts; {stays}")
+    if excited.twin:
+        return PairVerdict(cv, name, "bad", f"{name} {excited.twin}; {stays}")
     if deviation[0] > TOLD * GAIN or gain <= half[0]:
         words = (
             f"the data cannot tell: a gain of {gain:.2g} ± {half[0]:.2g} times the present one fits as well"

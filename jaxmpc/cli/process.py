@@ -145,7 +145,7 @@ def _named(stem: str) -> str:
 
 def _fmu_of(model: Any, folder: Path) -> tuple[str, str]:
     """The FMU of a model as the process file names it, or why it is not among the plants."""
-    import hashlib
+    from identify.fmu import fmu_digest
 
     found = dict(model.provenance)
     if not found.get("fmu"):
@@ -153,7 +153,7 @@ def _fmu_of(model: Any, folder: Path) -> tuple[str, str]:
     path = Path(found["fmu"])
     if not path.is_file():
         return "", f"Without the FMU as a plant: {path} is not there any more."
-    if hashlib.sha256(path.read_bytes()).hexdigest() != found.get("fmu_hash"):
+    if fmu_digest(path) != found.get("fmu_hash"):
         return "", f"Without the FMU as a plant: {path} is another one now; identify it again."
     return _relative(path, folder), ""
 
@@ -175,8 +175,6 @@ def _relative(file: Path, folder: Path) -> str:
 def check(options: Options) -> int:
     """Judge a process file and its model, and draw the step responses."""
     check_folder("--out", options.out)
-    import numpy as np
-
     from figures.process import draw_responses
     from identify.judge import judge
     from identify.plants import model_of
@@ -194,9 +192,8 @@ def check(options: Options) -> int:
         if looked
         else f"{process.name}: nothing to mend."
     )
-    responses = np.concatenate([np.asarray(model.coefficients), np.asarray(model.dv_coefficients)], axis=1)
-    measured = list(zip(model.dv_names, model.dv_units or ("1",) * len(model.dv_names), strict=True))
-    for path in draw_responses(process, responses, measured, options.out):
+    measured = [(name, model.units[name]) for name in model.dv_names]
+    for path in draw_responses(process, model.responses, measured, options.out):
         print(path)
     return EXIT_OPTIMAL
 

@@ -78,8 +78,7 @@ class Identification:
     @property
     def responses(self) -> Float[np.ndarray, "cv input n"]:
         """Coefficients of the MVs, then of the DVs [CV unit per input unit]."""
-        parts = self.model.coefficients, self.model.dv_coefficients
-        return np.concatenate([np.asarray(part) for part in parts], axis=1)
+        return self.model.responses
 
     @property
     def worst(self) -> Verdict:

@@ -65,6 +65,26 @@ class StepResponseModel(eqx.Module):
         """N, the number of step-response coefficients."""
         return self.coefficients.shape[-1]
 
+    @property
+    def responses(self) -> Float[np.ndarray, "cv input n"]:
+        """Coefficients of the MVs, then of the DVs, on the host [CV unit per input unit]."""
+        return np.concatenate([np.asarray(self.coefficients), np.asarray(self.dv_coefficients)], axis=1)
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Of the MVs, then of the DVs."""
+        return (*self.mv_names, *self.dv_names)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """By the names of CVs, MVs and DVs; 1 where the model names none."""
+        own = (self.cv_names, self.cv_units), (self.mv_names, self.mv_units), (self.dv_names, self.dv_units)
+        return {
+            name: unit
+            for names, units in own
+            for name, unit in zip(names, units or ("1",) * len(names), strict=True)
+        }
+
     def extended(self, samples: int) -> Float[Array, "cv mv samples"]:
         """S(1)..S(samples), cut or continued with its last value (the process is stable, thesis 2.3.4)."""
         return _extended(self.coefficients, samples)

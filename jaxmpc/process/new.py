@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -50,107 +51,142 @@ def new_process(
     Raises:
         InputError: for names that no process may have, MVs that the model has not, or steps that are not positive.
     """
-    found = dict(model.provenance)
-    moved = {mv: dict(how) for mv, how in dict(found.get("actuators", ())).items()}
-    listed = {mv: how["values"] for mv, how in moved.items() if how["kind"] == "values"}
-    switches = (
-        *switches,
-        *(mv for mv, how in moved.items() if how["kind"] == "on-off" and mv not in switches),
-    )
-    own = {mv: how["step"] for mv, how in moved.items() if how["kind"] == "stepped" and mv not in switches}
-    steps = own | dict(steps or {})
-    _check(model, steps, switches)
-    point = dict(model.working_point)
-    cv_units, mv_units = (units or ("1",) * len(names) for units, names in _names(model))
-    declared = dict(found.get("ranges", ()))
-    known = declared | dict(limits or {})
-    ranges = {
-        mv: known.get(mv) or _range(unit, point.get(mv), mv in switches)
-        for mv, unit in zip(model.mv_names, mv_units, strict=True)
-    }
-    spans = np.array([(high - low) / (1 if mv in switches else 4) for mv, (low, high) in ranges.items()])
-    moves = {
-        mv: high - low if mv in {*switches, *listed} else steps.get(mv) or _round((high - low) / 50)
-        for mv, (low, high) in ranges.items()
-    }
+    mvs = _mvs(model, steps or {}, switches, limits or {})
+    point, units = dict(model.working_point), model.units
     gains = np.asarray(model.coefficients)[:, :, -1]
-    reach = np.abs(gains) @ spans
-    cv_spans = [_round(value) if value > 0 else 1.0 for value in reach]
+    reach = np.abs(gains) @ [mv.span for mv in mvs]
+    spans = {cv: _round(value) if value > 0 else 1.0 for cv, value in zip(model.cv_names, reach, strict=True)}
     horizon, control = _horizons(model)
-    guesses = [] if model.cv_units and model.mv_units else ["all units: the model names none"]
-    if not point:
-        guesses.append(
-            "the working point: the model has none, so that all CVs and MVs are deviations from it"
-        )
-    for (mv, (low, high)), unit in zip(ranges.items(), mv_units, strict=True):
-        if mv not in known:
-            how = ", one or the other" if mv in switches else f", and at most {moves[mv]:g} per sample"
-            guesses.append(f"the range of {mv}: {low:g} to {amount(high, unit)}{how}")
-        elif mv not in switches:
-            guesses.append(f"the largest move of {mv}: {amount(moves[mv], unit)} per sample")
-    guesses += [
-        f"the span of {cv}: {amount(span, unit)}, by what the MVs do to it"
-        for cv, span, unit in zip(model.cv_names, cv_spans, cv_units, strict=True)
-    ]
-    guesses.append(f"horizons of {horizon} and {control} samples, by how long the responses take")
-    guesses.append("all weights, deadzones and setpoints")
     lines = _head(model, file, name, fmu)
-    for cv, unit, span in zip(model.cv_names, cv_units, cv_spans, strict=True):
+    for cv, span in spans.items():
+        why = "guessed from the gains and the ranges of the MVs"
+        lines += ["[[cv]]", *_variable(cv, units[cv], span, why), ""]
+    for mv in mvs:
+        lines += mv.lines()
+    for dv in model.dv_names:
+        head = "[[disturbance]] # measured: the model has responses to it"
+        lines += [head, *_variable(dv, units[dv], 1.0, "guessed"), ""]
+    for cv, span in spans.items() if not fmu else ():  # an FMU has no loads on its CVs
         lines += [
-            "[[cv]]",
-            *_variable(cv, unit, span, "guessed from the gains and the ranges of the MVs"),
-            "",
-        ]
-    for mv, unit, span in zip(model.mv_names, mv_units, spans.tolist(), strict=True):
-        low, high = ranges[mv]
-        lines += [
-            "[[mv]]",
-            *_variable(mv, unit, span, f"guessed: {'all' if mv in switches else 'a quarter'} of its range"),
-        ]
-        guessed = "" if mv in known else " # guessed"
-        guessed = " # as the FMU declares it" if mv in declared and mv not in (limits or {}) else guessed
-        lines += [f"low = {low:g}{guessed}", f"high = {high:g}{guessed}"]
-        if mv in switches:
-            lines += ['actuator = { kind = "on-off" } # stands at low or at high']
-        elif mv in listed:
-            lines += [
-                f"move = {moves[mv]:g}",
-                f'actuator = {{ kind = "values", values = {list(listed[mv])} }}',
-            ]
-        elif mv in steps:
-            lines += [f"move = {moves[mv]:g} # guessed: largest move per sample"]
-            lines += [f'actuator = {{ kind = "stepped", step = {steps[mv]:g} }}']
-        else:
-            lines += [f"move = {moves[mv]:g} # guessed: largest move per sample"]
-        lines.append("")
-    for dv, unit in zip(model.dv_names, model.dv_units or ("1",) * len(model.dv_names), strict=True):
-        lines += [
-            "[[disturbance]] # measured: the model has responses to it",
-            *_variable(dv, unit, 1.0, "guessed"),
-            "",
-        ]
-    for cv, unit, span in zip(model.cv_names, cv_units, cv_spans, strict=True):
-        if fmu:
-            break  # an FMU has no loads on its CVs
-        lines += ["[[disturbance]] # not measured: added to the CV"]
-        lines += [
+            "[[disturbance]] # not measured: added to the CV",
             f'name = "output.{cv}"',
-            f"unit = {toml_value(unit)}",
+            f"unit = {toml_value(units[cv])}",
             f'label = "load on {cv.replace("_", " ")}"',
+            f"span = {_round(span / 5):g}",
+            "",
         ]
-        lines += [f"span = {_round(span / 5):g}", ""]
-    stepped = [moves[mv] if mv in switches else steps.get(mv, 0.0) for mv in model.mv_names]
+    stepped = [mv.move if mv.kind == "on-off" else mv.step for mv in mvs]
     jumps = np.abs(gains) @ stepped  # what one step of each of them does
     zones = [
-        _rounded_up(max(span / 50, jump / 2)) for span, jump in zip(cv_spans, jumps.tolist(), strict=True)
+        _rounded_up(max(span / 50, jump / 2))
+        for span, jump in zip(spans.values(), jumps.tolist(), strict=True)
     ]
-    lines += _tuning(model, cv_spans, list(moves.values()), zones, horizon, control)
+    lines += _tuning(model, list(spans.values()), [mv.move for mv in mvs], zones, horizon, control)
     shifts = [
-        _shift(low, high, point.get(mv, 0.0), span, steps.get(mv), mv in switches)
-        for (mv, (low, high)), span in zip(ranges.items(), spans.tolist(), strict=True)
+        _shift(mv.low, mv.high, point.get(mv.name, 0.0), mv.span, mv.step or None, mv.kind == "on-off")
+        for mv in mvs
     ]
     lines += _references(model, np.array(shifts), point, horizon)
-    return "\n".join(lines), guesses
+    return "\n".join(lines), _guesses(model, mvs, spans, horizon, control)
+
+
+class _Mv(NamedTuple):
+    """An MV of the file.
+
+    Attributes:
+        source: of its limits, a comment; None where they are guessed.
+        kind: of its actuator; empty where it takes every value.
+        step: of whole steps [MV unit]; 0 without.
+        values: that it takes.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    source: str | None
+    kind: Literal["", "on-off", "values", "stepped"]
+    step: float
+    values: tuple[float, ...]
+
+    @property
+    def span(self) -> float:
+        """How far it typically moves [MV unit]."""
+        return (self.high - self.low) / (1 if self.kind == "on-off" else 4)
+
+    @property
+    def move(self) -> float:
+        """Largest move per sample [MV unit]."""
+        if self.kind in ("on-off", "values"):
+            return self.high - self.low
+        return self.step or _round((self.high - self.low) / 50)
+
+    def lines(self) -> list[str]:
+        """Its section."""
+        share = "all" if self.kind == "on-off" else "a quarter"
+        source = " # guessed" if self.source is None else self.source
+        move = f"move = {self.move:g}"
+        guessed = f"{move} # guessed: largest move per sample"
+        actuator = {
+            "": [guessed],
+            "on-off": ['actuator = { kind = "on-off" } # stands at low or at high'],
+            "values": [move, f'actuator = {{ kind = "values", values = {list(self.values)} }}'],
+            "stepped": [guessed, f'actuator = {{ kind = "stepped", step = {self.step:g} }}'],
+        }
+        return [
+            "[[mv]]",
+            *_variable(self.name, self.unit, self.span, f"guessed: {share} of its range"),
+            f"low = {self.low:g}{source}",
+            f"high = {self.high:g}{source}",
+            *actuator[self.kind],
+            "",
+        ]
+
+
+def _mvs(
+    model: StepResponseModel,
+    steps: Mapping[str, float],
+    switches: Sequence[str],
+    limits: Mapping[str, tuple[float, float]],
+) -> list[_Mv]:
+    """The MVs with what is asked for, what the model was identified from says, and guesses; see `new_process`."""
+    found, point = dict(model.provenance), dict(model.working_point)
+    moved = {mv: dict(how) for mv, how in dict(found.get("actuators", ())).items()}
+    of = lambda kind: [mv for mv, how in moved.items() if how["kind"] == kind]  # noqa: E731
+    switches = list(dict.fromkeys([*switches, *of("on-off")]))
+    steps = {mv: moved[mv]["step"] for mv in of("stepped") if mv not in switches} | dict(steps)
+    _check(model, steps, switches)
+    declared, out = dict(found.get("ranges", ())), []
+    for mv in model.mv_names:
+        known = limits.get(mv) or declared.get(mv)
+        low, high = known or _range(model.units[mv], point.get(mv), mv in switches)
+        source = "" if mv in limits else " # as the FMU declares it" if mv in declared else None
+        listed = mv in of("values")
+        kind = "on-off" if mv in switches else "values" if listed else "stepped" if mv in steps else ""
+        values = moved[mv]["values"] if listed else ()
+        out.append(_Mv(mv, model.units[mv], low, high, source, kind, steps.get(mv, 0.0), values))
+    return out
+
+
+def _guesses(
+    model: StepResponseModel, mvs: Sequence[_Mv], spans: Mapping[str, float], horizon: int, control: int
+) -> list[str]:
+    """What the file says that nobody said."""
+    out = [] if model.cv_units and model.mv_units else ["all units: the model names none"]
+    if not model.working_point:
+        out.append("the working point: the model has none, so that all CVs and MVs are deviations from it")
+    for mv in mvs:
+        if mv.source is None:
+            how = ", one or the other" if mv.kind == "on-off" else f", and at most {mv.move:g} per sample"
+            out.append(f"the range of {mv.name}: {mv.low:g} to {amount(mv.high, mv.unit)}{how}")
+        elif mv.kind != "on-off":
+            out.append(f"the largest move of {mv.name}: {amount(mv.move, mv.unit)} per sample")
+    out += [
+        f"the span of {cv}: {amount(span, model.units[cv])}, by what the MVs do to it"
+        for cv, span in spans.items()
+    ]
+    out.append(f"horizons of {horizon} and {control} samples, by how long the responses take")
+    return [*out, "all weights, deadzones and setpoints"]
 
 
 def _check(model: StepResponseModel, steps: Mapping[str, float], switches: Sequence[str]) -> None:
@@ -170,10 +206,6 @@ def _check(model: StepResponseModel, steps: Mapping[str, float], switches: Seque
             raise InputError("--step", f"{mv}={step:g}", "a positive step [MV unit]")
         if mv in switches:
             raise InputError("--step", f"{mv}={step:g}", "nothing: it is on or off")
-
-
-def _names(model: StepResponseModel) -> tuple[tuple[tuple[str, ...], tuple[str, ...]], ...]:
-    return (model.cv_units, model.cv_names), (model.mv_units, model.mv_names)
 
 
 def _round(value: float, digits: int = 2) -> float:
