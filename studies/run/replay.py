@@ -29,7 +29,7 @@ from jaxmpc.process.process import Process
 from studies.definition.comparison import ControllerDefinition
 from studies.run.comparison import labelled, progress_bar, results_layout, run_missing, shared_variables
 from studies.store.files import RESULTS
-from studies.store.fingerprint import content_hash, source_hash
+from studies.store.fingerprint import content_hash, packages_hash
 from studies.store.layout import StoreLayout
 from studies.store.writing import check_writable, locked
 
@@ -157,7 +157,7 @@ def _layout(
     read: Log,
 ) -> StoreLayout:
     """The store of a replay: a comparison of one controller, its samples at the times of the log."""
-    code = {package: source_hash(package) for package in ("jaxmpc", "identify")}
+    code = packages_hash()
     told = [np.asarray(getattr(done, key)) for key in ("time", "cv", "setpoint", "mv", "dv")]
     stretches = [[own.start, own.stop] for own in done.stretches]
     inputs: dict[str, Any] = {

@@ -63,6 +63,11 @@ def source_hash(package: str) -> str:
     return content_hash(trees)
 
 
+def packages_hash() -> dict[str, str]:
+    """`source_hash` of the packages that every closed loop depends on, by name."""
+    return {package: source_hash(package) for package in ("jaxmpc", "identify")}
+
+
 @functools.cache
 def module_hash(name: str) -> str:
     """Hash of the statements of one module, found without importing it."""
