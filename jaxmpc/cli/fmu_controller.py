@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from jaxmpc.check import located
 from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, choice, command, option
 from jaxmpc.errors import InputError
 
@@ -32,10 +33,9 @@ def controller(options: Options) -> int:
     if integer and not process.stepped:
         expected = f"continuous: every MV of {process.name} takes all values"
         raise InputError("--controller", options.controller, expected)
-    if options.preset is not None and options.preset not in process.presets:
-        raise InputError("--preset", options.preset, f"one of {', '.join(process.presets)}")
     structure = process.structure(integer=integer)
-    tuning = process.tuning(structure, options.preset)
+    with located(lambda _: "--preset"):
+        tuning = process.tuning(structure, options.preset)
     model = model_of(process)
     for note in settling_notes(model):
         print(f"jaxmpc: {note}", file=sys.stderr)

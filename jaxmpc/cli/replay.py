@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from jaxmpc.check import among
 from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, command, option
-from jaxmpc.errors import InputError
 from jaxmpc.files import check_folder
 
 KINDS = ("mixed-integer", "continuous")
@@ -24,8 +24,8 @@ KINDS = ("mixed-integer", "continuous")
 )
 def replay(options: Options) -> int:
     """Say what a controller would have advised at every sample of a log, beside what was done."""
-    if options.controller not in (None, *KINDS):
-        raise InputError("--controller", options.controller, f"one of {', '.join(KINDS)}")
+    if options.controller is not None:
+        among("--controller", options.controller, KINDS)
     check_folder("--out", options.out)
     from jaxmpc.process.file import load_process
     from jaxmpc.programs.compilation import is_quiet

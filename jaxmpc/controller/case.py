@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from jaxmpc.check import LARGEST, is_count, sound
+from jaxmpc.check import LARGEST, among, is_count, sound
 from jaxmpc.decoding import decode
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
@@ -303,8 +303,7 @@ def _given_blocks(given: Any, names: tuple[str, ...]) -> tuple[Any, ...]:
 
 
 def _check_mv(path: str, value: Any, name: str, names: tuple[str, ...]) -> None:
-    if name not in names:
-        raise InputError(path, value, f"one of the MV names {', '.join(names)}")
+    among(path, name, names, "one of the MV names", value)
 
 
 def _given_horizon(given: int | dict[str, Any], integer: dict[str, Any], names: tuple[str, ...]) -> tuple:

@@ -21,6 +21,7 @@ from jax.core import Tracer
 from jaxtyping import ArrayLike, Bool, Float
 
 from jaxmpc import status as codes
+from jaxmpc.check import among
 from jaxmpc.controller.build import Scenarios
 from jaxmpc.controller.core import ControllerState, Core, Moment, StepInfo
 from jaxmpc.controller.sample import Sample, checked, checked_off, checked_start
@@ -327,8 +328,7 @@ def _actuators(structure: Structure, moment: Moment) -> list[list[Actuator]]:
 
 def check_finish(finish: str) -> str:
     """A path that closes integer problems, or an `InputError`."""
-    if finish not in FINISHES:
-        raise InputError("finish", finish, f"one of {', '.join(FINISHES)}")
+    among("finish", finish, FINISHES)
     return finish
 
 

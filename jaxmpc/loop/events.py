@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
+from jaxmpc.check import among
 from jaxmpc.controller.controller import Batch
 from jaxmpc.controller.core import without
 from jaxmpc.errors import InputError
@@ -111,8 +112,7 @@ def _names(path: str, given: Any, known: tuple[str, ...]) -> set[str]:
     if isinstance(given, str) or not isinstance(given, Sequence):
         raise InputError(path, given, f"a list of names among {', '.join(known)}")
     for name in given:
-        if name not in known:
-            raise InputError(path, name, f"names among {', '.join(known)}")
+        among(path, name, known, "names among")
     return set(given)
 
 

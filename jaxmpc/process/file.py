@@ -16,9 +16,8 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from jaxmpc.check import as_floats, is_number, located, require
+from jaxmpc.check import among, as_floats, is_number, located, require
 from jaxmpc.decoding import decode
-from jaxmpc.errors import near
 from jaxmpc.files import read_named_toml
 from jaxmpc.process.process import Process
 from jaxmpc.process.reference import Reference
@@ -187,10 +186,7 @@ def _check_names(file: ProcessFile) -> None:
             seen[section.name] = path
     channels = [s.name for s in (*file.cv, *file.mv)]
     for i, section in enumerate(file.key_figure):
-        expected = f"a CV or an MV: {', '.join(channels)}"
-        require(
-            section.integral_of in channels, f"key_figure[{i}].integral_of", section.integral_of, expected
-        )
+        among(f"key_figure[{i}].integral_of", section.integral_of, channels, "a CV or an MV:")
     for table in ("presets", "references", "plants", "disturbances"):
         for name in getattr(file, table):
             expected = "a letter, then up to 63 letters, digits, '-' and '_'"
@@ -206,8 +202,7 @@ def _check_model(file: ProcessFile) -> None:
     loads = [f"output.{name}" for name in cvs]
     responses_of(source.responses, {"cv": cvs, "mv": mvs, "dv": [d for d in disturbances if d not in loads]})
     for name, values in source.schedule.items():
-        expected = f"one of the MVs {', '.join(mvs)}"
-        require(name in mvs, f"model.schedule.{name}", values, expected, near(name, mvs))
+        among(f"model.schedule.{name}", name, mvs, "one of the MVs", values)
     for table, known, other in (
         ("working_point", [*cvs, *mvs] if source.responses else mvs, ""),
         ("steps", mvs, " other than 0"),
@@ -215,7 +210,7 @@ def _check_model(file: ProcessFile) -> None:
     ):
         for name, value in getattr(source, table).items():
             path = f"model.{table}.{name}"
-            require(name in known, path, value, f"one of {', '.join(known)}", near(name, known))
+            among(path, name, known, "one of", value)
             good = is_number(value) and (value != 0 or not other)
             require(good, path, value, f"a finite number{other} [MV unit]")
 
@@ -238,7 +233,7 @@ def _preset(
     if base is None:
         return own
     path, known = f"presets.{name}.base", [other for other in presets if other not in (*seen, name)]
-    require(base in known, path, base, f"another preset that is not made of this one: {', '.join(known)}")
+    among(path, base, known, "another preset that is not made of this one:")
     return {**_preset(presets, base, (*seen, name)), **own}
 
 

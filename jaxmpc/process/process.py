@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from jaxmpc import html
-from jaxmpc.errors import InputError, near
+from jaxmpc.check import among
+from jaxmpc.errors import InputError
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS, Tuning, make_tuning
 from jaxmpc.process.actuator import Actuator
@@ -159,10 +160,7 @@ class Process:
             InputError: for an unknown preset; unknown fields are refused by `make_tuning`.
         """
         preset = self.default_preset if preset is None else preset
-        if preset not in self.presets:
-            raise InputError(
-                "tuning", preset, f"one of the presets {', '.join(self.presets)}", near(preset, self.presets)
-            )
+        among("tuning", preset, self.presets, "one of the presets")
         own: Fields = {}
         for key, field, variables in (
             ("cv_low", "low", self.cvs),
@@ -202,10 +200,7 @@ class Process:
             InputError: for an unknown name.
         """
         name = self.default_reference if name is None else name
-        if name not in self.references:
-            raise InputError(
-                "reference", name, f"one of {', '.join(self.references)}", near(name, self.references)
-            )
+        among("reference", name, self.references)
         return self.references[name]
 
     def _complete(self, key: str, value: Any) -> Any:

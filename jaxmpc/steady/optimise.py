@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxmpc.check import is_number
+from jaxmpc.check import among, is_number
 from jaxmpc.errors import InputError
 from jaxmpc.steady.map import SteadyMap, barycentric
 from jaxmpc.steady.milp import PiecewiseMilp
@@ -193,8 +193,7 @@ def _named(path: str, given, names: tuple[str, ...], unit: str) -> dict[str, flo
     if not isinstance(given, Mapping):
         raise InputError(path, given, f"a mapping from name to number [{unit}]")
     for name, value in given.items():
-        if name not in names:
-            raise InputError(f"{path}.{name}", value, f"one of the names {', '.join(names)}")
+        among(f"{path}.{name}", name, names, "one of the names", value)
         if not is_number(value):
             raise InputError(f"{path}.{name}", value, f"a finite number [{unit}]")
     return {name: float(value) for name, value in given.items()}
@@ -263,8 +262,7 @@ def _by_mv(path: str, given, map: SteadyMap, expected: str) -> Mapping[str, Any]
     if not isinstance(given, Mapping):
         raise InputError(path, given, expected)
     for name, value in given.items():
-        if name not in map.mv_names:
-            raise InputError(f"{path}.{name}", value, f"one of the names {', '.join(map.mv_names)}")
+        among(f"{path}.{name}", name, map.mv_names, "one of the names", value)
     return given
 
 
