@@ -62,9 +62,8 @@ class Limited(Variable, frozen=True):
 class Cv(Limited, frozen=True):
     """A controlled variable (``[[cv]]``); its limits are soft."""
 
-    settled: float = (
-        0.0  # half width around the setpoint in which it counts as settled; a fiftieth of the span
-    )
+    # half width around the setpoint in which it counts as settled; a fiftieth of the span, if not given [CV unit]
+    settled: float = 0.0
     setpoint_tag: str = ""  # what logs call its setpoint, if they have it
 
     def __post_init__(self):
@@ -89,9 +88,8 @@ class Mv(Limited, frozen=True):
     """A manipulated variable (``[[mv]]``)."""
 
     move: Positive = np.inf  # largest move per sample, for presets that do not give their own [MV unit]
-    smallest_move: float | None = (
-        None  # what counts as a move in key figures is larger; a thousandth of the span
-    )
+    # what counts as a move in key figures is larger; a thousandth of the span, if not given [MV unit]
+    smallest_move: float = None  # pyright: ignore[reportAssignmentType]
     moved_by: ActuatorSection = msgspec.field(name="actuator", default=ActuatorSection("continuous"))
 
     def __post_init__(self):
