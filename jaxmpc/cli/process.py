@@ -212,14 +212,9 @@ def keys(options: Options) -> int:
 
     process = load_process(options.process)
     tuning = process.tuning(process.structure())
-    at = {name: i for names in (process.cv_names, process.mv_names) for i, name in enumerate(names)}
     rows = [("key", "unit", "default", "meaning")]
     for key, field in study_fields(process, parameters_of(process, options.plant)).items():
-        given = field.default
-        if given is None and key.startswith("tuning."):
-            name, _, channel = key.removeprefix("tuning.").partition(".")
-            given = getattr(tuning, name)
-            given = float(given[at[channel]] if channel else given)
+        given = field.held(process, tuning)
         given = "" if given is None else given
         rows.append((key, field.unit, given if isinstance(given, str) else as_text(given), field.label))
     wide = [max(len(str(row[i])) for row in rows) for i in range(3)]

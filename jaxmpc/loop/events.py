@@ -19,7 +19,7 @@ from jaxmpc.controller.core import without
 from jaxmpc.errors import InputError
 from jaxmpc.loop.interventions import checked_sample
 from jaxmpc.problem.structure import Structure
-from jaxmpc.problem.tuning import FIELDS, Tuning, make_tuning
+from jaxmpc.problem.tuning import Tuning, by_name, make_tuning
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +61,7 @@ def stages_of(
         InputError: naming the event and the field, for times outside the run or before the event before, unknown names, and
             tunings that do not hold together.
     """
-    fields, off = _fields(structure, tuning), {"cv": set(), "mv": set()}
+    fields, off = by_name(structure, tuning), {"cv": set(), "mv": set()}
     names = {"cv": structure.cv_names, "mv": structure.mv_names}
     flags = lambda kind: np.array([name in off[kind] for name in names[kind]])  # noqa: E731
     stages, now = [Stage(0, tuning, flags("mv"))], tuning
@@ -79,7 +79,7 @@ def stages_of(
             fields[field] = {**fields[field], **new} if part else new
         if event.tuning:
             tuning = make_tuning(structure, path=f"{at}.tuning", **fields)
-            fields = _fields(structure, tuning)
+            fields = by_name(structure, tuning)
         for kind, known in names.items():
             goes, comes = (
                 _names(f"{at}.{kind}_{way}", getattr(event, f"{kind}_{way}"), known) for way in ("off", "on")
@@ -96,16 +96,6 @@ def stages_of(
         stage = Stage(first, now, flags("mv"))
         stages = [*(s for s in stages if s.first < first), stage]
     return stages
-
-
-def _fields(structure: Structure, tuning: Tuning) -> dict[str, Any]:
-    """The fields of a tuning as `make_tuning` takes them, by name where there is one value per CV or MV."""
-    names = {"cv": structure.cv_names, "mv": structure.mv_names}
-    found = {}
-    for key, field in FIELDS.items():
-        values = np.asarray(getattr(tuning, key)).tolist()
-        found[key] = dict(zip(names[field.of], values, strict=True)) if field.of else values
-    return found
 
 
 def _names(path: str, given: Any, known: tuple[str, ...]) -> set[str]:
