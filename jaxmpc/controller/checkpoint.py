@@ -17,8 +17,8 @@ import numpy as np
 
 from jaxmpc.check import among, check_keys
 from jaxmpc.controller.controller import Controller
-from jaxmpc.controller.core import ControllerState
 from jaxmpc.controller.schedule import ModelSchedule, ScheduledController
+from jaxmpc.controller.state import ControllerState
 from jaxmpc.errors import InputError
 from jaxmpc.files import from_strict_json, read_json, strict_json, write_atomically
 from jaxmpc.model.step_response import StepResponseModel

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jaxmpc.check import among
-from jaxmpc.controller.controller import Batch
+from jaxmpc.controller.batch import Batch
 from jaxmpc.controller.core import without
 from jaxmpc.errors import InputError
 from jaxmpc.loop.interventions import checked_sample

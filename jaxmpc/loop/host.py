@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.controller.core import ControllerState, StepInfo
 from jaxmpc.controller.measurement import received
 from jaxmpc.controller.sample import Sample
+from jaxmpc.controller.state import ControllerState, StepInfo
 from jaxmpc.loop.compiled import Inputs
 from jaxmpc.loop.events import Course, Stage
 from jaxmpc.loop.interventions import CarriedOut

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc import status
-from jaxmpc.controller.controller import Batch
+from jaxmpc.controller.batch import Batch
 from jaxmpc.controller.measurement import MISSING, received
 from jaxmpc.errors import PlantError
 from jaxmpc.loop.compiled import Inputs

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.controller.controller import Batch
+from jaxmpc.controller.batch import Batch
 from jaxmpc.errors import InputError
 from jaxmpc.loop.compiled import Inputs
 from jaxmpc.loop.events import Stage, has_lanes, staged

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from identify.plants import closing, disturbance_of, open_plant
-from jaxmpc.controller.controller import Controllers
+from jaxmpc.controller.batch import Controllers
 from jaxmpc.files import strict_json
 from jaxmpc.loop.simulate import simulate_batches
 from jaxmpc.loop.trajectory import TrajectoryBatch

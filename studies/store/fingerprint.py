@@ -24,7 +24,7 @@ import numpy as np
 
 # Modules of `jaxmpc` that no closed loop depends on.
 EDGE_FOLDERS = ("cli", "steady")
-EDGE_MODULES = ("html", "controller/case", "controller/plan")
+EDGE_MODULES = ("html", "controller/case", "controller/given", "controller/plan")
 
 
 def content_hash(*parts: Any) -> str:
