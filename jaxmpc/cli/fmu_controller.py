@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from jaxmpc.check import located
 from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, choice, command, option
 from jaxmpc.errors import InputError
 
@@ -25,6 +24,7 @@ def controller(options: Options) -> int:
     check_fmu_target("--out", options.out)
     from identify.plants import model_of
     from identify.step_test import settling_notes
+    from jaxmpc.check import located
     from jaxmpc.controller.controller import Controller
     from jaxmpc.process.file import load_process
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from jaxmpc.check import among
 from jaxmpc.cli.identify_data import DATA_OPTIONS, identify_data
 from jaxmpc.cli.identify_fmu import FMU_OPTIONS, identify_fmu
 from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, choice, command, named_number, option
@@ -114,6 +113,7 @@ def _identify_process(options: Options) -> int:
     check_target("--out", options.out)
     from identify.plants import closing, identified, open_plant
     from identify.step_test import settling_notes
+    from jaxmpc.check import among
     from jaxmpc.process.file import DEFAULT_PROCESS, load_process
 
     process = load_process(options.source or DEFAULT_PROCESS)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jaxmpc.check import among
 from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, command, option
 from jaxmpc.files import check_folder
 
@@ -24,6 +23,8 @@ KINDS = ("mixed-integer", "continuous")
 )
 def replay(options: Options) -> int:
     """Say what a controller would have advised at every sample of a log, beside what was done."""
+    from jaxmpc.check import among
+
     if options.controller is not None:
         among("--controller", options.controller, KINDS)
     check_folder("--out", options.out)
