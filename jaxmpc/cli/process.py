@@ -55,9 +55,7 @@ def new(options: Options) -> int:
     from jaxmpc.process.new import new_process
 
     out: Path = options.out or options.model.with_suffix(".toml")
-    check_target("--out", out)
-    if out.exists():
-        raise InputError("--out", str(out), "a file that does not exist yet: yours is not overwritten")
+    _check_new(out)
     model = StepResponseModel.load(options.model)
     name = _named(out.stem)
     file = _relative(options.model, out.parent)
@@ -90,9 +88,7 @@ def _new_from_septic(options: Options) -> int:
     out: Path = options.out or folder / f"{_named(options.septic.resolve().stem)}.toml"
     model_file, page = out.with_suffix(".json"), out.with_name(f"{out.stem}-septic.md")
     for target in (out, model_file, page):
-        check_target("--out", target)
-        if target.exists():
-            raise InputError("--out", str(target), "a file that does not exist yet: yours is not overwritten")
+        _check_new(target)
     steps = dict(named_number("--step", text) for text in options.step or ())
     choices = Choices(options.application, options.weights or "span", steps, tuple(options.on_off or ()))
     made = read_application(options.septic, model_file.name, _named(out.stem), asked_in(options), choices)
@@ -135,6 +131,13 @@ def export(options: Options) -> int:
     print(*files, sep="\n")
     print(*report.summary(), *report.notes, sep="\n  ")
     return EXIT_OPTIMAL
+
+
+def _check_new(target: Path) -> None:
+    """Refuse a file that could not be written, or that is there already."""
+    check_target("--out", target)
+    if target.exists():
+        raise InputError("--out", str(target), "a file that does not exist yet: yours is not overwritten")
 
 
 def _named(stem: str) -> str:
