@@ -18,7 +18,7 @@ import xarray as xr
 
 from figures import closed_loop, style
 from figures.closed_loop import RUN
-from figures.explore import COLOURS, SCHEMA, Spec, look
+from figures.explore import COLOURS, Spec, coded, described
 from figures.sweep.data import (
     SETTLED,
     SweepAxis,
@@ -170,21 +170,11 @@ def parallel(runs: Runs, kept: np.ndarray, width: int = 820, height: int = 220) 
     Args:
         kept: ``"run"``, those that are not pale.
     """
-    scales = _scales(runs)
-    drawn = np.flatnonzero(kept) if kept.any() else np.arange(0)
+    scales, names = _scales(runs), runs.table["run"]
+    numbers = {"n": runs.table["number"], "kept": kept}
     table = pd.concat(
-        [
-            pd.DataFrame(
-                {
-                    "axis": name,
-                    "position": scale.positions,
-                    "run": runs.table["run"],
-                    "n": runs.table["number"],
-                    "kept": kept,
-                }
-            )
-            for name, scale in scales.items()
-        ]
+        pd.DataFrame({"axis": name, "position": scale.positions, "run": names, **numbers})
+        for name, scale in scales.items()
     )
     table["best"] = np.tile(runs.table["best"] == "on the front", len(scales))
     ends = [
@@ -192,65 +182,31 @@ def parallel(runs: Runs, kept: np.ndarray, width: int = 820, height: int = 220) 
         for name, scale in scales.items()
         for place, text in zip((0.0, 1.0), scale.ends, strict=True)
     ]
-    wrapped = (
-        "["
-        + ", ".join(f"{textwrap.wrap(name, 18)!r}" for name in scales)
-        + "][indexof(domain('x'), datum.value)]"
-    )
-    x = {
-        "field": "axis",
-        "type": "nominal",
-        "sort": list(scales),
-        "scale": {"type": "point", "padding": 0.4},
-        "axis": {
-            "title": None,
-            "labelAngle": 0,
-            "labelExpr": wrapped,
-            "orient": "bottom",
-            "grid": True,
-            "gridColor": "#999999",
-        },
-    }
-    y = {"field": "position", "type": "quantitative", "axis": None, "scale": {"domain": [-0.1, 1.1]}}
-    colour = {
-        "condition": {"test": "datum.kept && datum.best", "value": style.VERMILLION},
-        "value": style.BLUE,
+    wrapped = ", ".join(f"{textwrap.wrap(name, 18)!r}" for name in scales)
+    labels = {"title": None, "labelAngle": 0, "labelExpr": f"[{wrapped}][indexof(domain('x'), datum.value)]"}
+    labels |= {"orient": "bottom", "grid": True, "gridColor": "#999999"}
+    x = coded("axis", "nominal", sort=list(scales), scale={"type": "point", "padding": 0.4}, axis=labels)
+    y = coded("position", "quantitative", axis=None, scale={"domain": [-0.1, 1.1]})
+    best = {"test": "datum.kept && datum.best", "value": style.VERMILLION}
+    strong = {"test": "datum.kept", "value": 0.75 if kept.sum() < 200 else 0.3}
+    shades = {
+        "color": {"condition": best, "value": style.BLUE},
+        "opacity": {"condition": strong, "value": 0.06},
     }
     lines = {
         "data": {"values": table.to_dict("records")},
         "params": [{"name": BRUSH, "select": {"type": "interval", "encodings": ["x", "y"]}}],
         "mark": {"type": "line", "strokeWidth": 1.2},
-        "encoding": {
-            "x": x,
-            "y": y,
-            "detail": {"field": "n"},
-            "color": colour,
-            "opacity": {
-                "condition": {"test": "datum.kept", "value": 0.75 if len(drawn) < 200 else 0.3},
-                "value": 0.06,
-            },
-            "tooltip": {"field": "run", "type": "nominal"},
-        },
+        "encoding": {"x": x, "y": y, "detail": {"field": "n"}, **shades, "tooltip": coded("run", "nominal")},
     }
+    offset = {"yOffset": {"expr": "datum.position > 0 ? -8 : 9"}}
     words = {
         "data": {"values": ends},
-        "mark": {
-            "type": "text",
-            "fontSize": 10,
-            "color": "#444444",
-            "yOffset": {"expr": "datum.position > 0 ? -8 : 9"},
-        },
+        "mark": {"type": "text", "fontSize": 10, "color": "#444444", **offset},
         "encoding": {"x": x, "y": y, "text": {"field": "text"}},
     }
-    renderer = {"renderer": "svg" if len(runs.table) < 500 else "canvas", "actions": False}
-    return {
-        "$schema": SCHEMA,
-        "width": width,
-        "height": height,
-        "layer": [lines, words],
-        "usermeta": {"embedOptions": renderer},
-        "config": look(),
-    }
+    renderer = "svg" if len(runs.table) < 500 else "canvas"
+    return described(renderer, width=width, height=height, layer=[lines, words])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -314,44 +270,23 @@ def importance(runs: Runs) -> pd.DataFrame:
 
 def importance_chart(runs: Runs, width: int = 300) -> Spec:
     """`importance` as bars."""
-    table = importance(runs)
-    x = {
-        "field": "share",
-        "type": "quantitative",
-        "axis": {"format": "%", "tickCount": 5},
-        "scale": {"domain": [0, 1]},
-    }
-    x |= {"title": "share of the variance"}
-    y = {
-        "field": "axis",
-        "type": "nominal",
-        "sort": list(runs.axes),
-        "title": None,
-        "axis": {"labelLimit": 240},
-    }
+    bar = {"axis": {"format": "%", "tickCount": 5}, "scale": {"domain": [0, 1]}}
     scale = {"domain": list(runs.titles.values()), "range": [style.BLUE, style.ORANGE]}
-    colour = {
-        "field": "figure",
-        "type": "nominal",
-        "scale": scale,
-        "legend": {"orient": "top", "title": None, "labelLimit": 300},
+    legend = {"orient": "top", "title": None, "labelLimit": 300}
+    encoding = {
+        "x": coded("share", "quantitative", **bar, title="share of the variance"),
+        "y": coded("axis", "nominal", sort=list(runs.axes), title=None, axis={"labelLimit": 240}),
+        "yOffset": {"field": "figure", "sort": scale["domain"]},
+        "color": coded("figure", "nominal", scale=scale, legend=legend),
     }
-    return {
-        "$schema": SCHEMA,
-        "width": width,
-        "height": {"step": 12},
-        "title": "What each axis alone decides",
-        "data": {"values": table.to_dict("records")},
-        "mark": {"type": "bar"},
-        "encoding": {
-            "x": x,
-            "y": y,
-            "yOffset": {"field": "figure", "sort": scale["domain"]},
-            "color": colour,
-        },
-        "usermeta": {"embedOptions": {"renderer": "svg", "actions": False}},
-        "config": look(),
-    }
+    return described(
+        width=width,
+        height={"step": 12},
+        title="What each axis alone decides",
+        data={"values": importance(runs).to_dict("records")},
+        mark={"type": "bar"},
+        encoding=encoding,
+    )
 
 
 def _explained(y: np.ndarray, groups: np.ndarray) -> float:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -66,11 +66,10 @@ def tracking(
     process = process_in(first)
     seconds, unit = panels.time_unit(*panels.span(first))
     table = pd.concat([_rows(run, process, seconds) for run in reversed(runs)])
-    legend = (
-        {"orient": "top", "title": None, "symbolType": "stroke", "labelLimit": 300} if len(runs) > 1 else None
-    )
+    above = {"orient": "top", "title": None, "symbolType": "stroke", "labelLimit": 300}
     scale = {"domain": [run.name for run in runs], "range": [run.colour for run in runs]}
-    colour = {"field": "run", "type": "nominal", "scale": scale, "sort": scale["domain"], "legend": legend}
+    legend = above if len(runs) > 1 else None
+    colour = coded("run", "nominal", scale=scale, sort=scale["domain"], legend=legend)
     of_run = {"color": colour, "detail": {"field": "run"}}
     top = [{"filter": {"field": "run", "equal": runs[0].name}}]
     out = []
@@ -107,7 +106,7 @@ def tracking(
             "y": _value("c0") | {"axis": {"labels": False, "ticks": False, "minExtent": LEFT}},
         },
     }
-    return _chart([*out, strip]) | {"data": inline(table)}
+    return described(vconcat=[*out, strip], spacing=6) | {"data": inline(table)}
 
 
 def planned(data: xr.Dataset, time: float, width: int = 375, height: int = 110) -> Spec:
@@ -127,8 +126,8 @@ def planned(data: xr.Dataset, time: float, width: int = 375, height: int = 110) 
     legend = {"orient": "top", "title": None, "symbolType": "stroke"}
     colours, dashes = ({"domain": names, "range": [look[k] for look in PLAN.values()]} for k in (0, 1))
     looks = {
-        "color": {"field": "what", "type": "nominal", "sort": None, "scale": colours, "legend": legend},
-        "strokeDash": {"field": "what", "type": "nominal", "scale": dashes, "legend": None},
+        "color": coded("what", "nominal", sort=None, scale=colours, legend=legend),
+        "strokeDash": coded("what", "nominal", scale=dashes, legend=None),
         "detail": {"field": "what"},
     }
     rule = {"type": "rule", "color": style.GREY, "strokeDash": [3, 3]}
@@ -163,7 +162,7 @@ def planned(data: xr.Dataset, time: float, width: int = 375, height: int = 110) 
                 "plan": (ahead, np.append(values[:, i], [after, after])),
             }
             rows[row].append(panel(style.label(mv.label + words, mv.unit), parts, "step-after", row == 2))
-    return _chart([{"hconcat": row, "spacing": 16} for row in rows])
+    return described(vconcat=[{"hconcat": row, "spacing": 16} for row in rows], spacing=6)
 
 
 def as_html(spec: Spec) -> str:
@@ -236,18 +235,12 @@ def _time(unit: str | None, *, labels: bool = True, domain: Any = None, axis: Sp
     """The time axis of a panel; it is labelled if `unit` is given."""
     title = None if unit is None else f"time [{unit}]"
     scale = {"nice": False} | ({} if domain is None else {"domain": domain})
-    return {
-        "field": "t",
-        "type": "quantitative",
-        "title": title,
-        "scale": scale,
-        "axis": axis or {"labels": labels},
-    }
+    return coded("t", "quantitative", title=title, scale=scale, axis=axis or {"labels": labels})
 
 
 def _value(name: str) -> Spec:
     axis = {"minExtent": LEFT, "tickCount": 4, "format": ",.6~g"}
-    return {"field": name, "type": "quantitative", "title": None, "scale": {"zero": False}, "axis": axis}
+    return coded(name, "quantitative", title=None, scale={"zero": False}, axis=axis)
 
 
 def _panel(title: str, layers: list[Spec], width: int, height: int) -> Spec:
@@ -255,22 +248,18 @@ def _panel(title: str, layers: list[Spec], width: int, height: int) -> Spec:
     return {"title": heading, "width": width, "height": height, "layer": layers}
 
 
-def _chart(rows: Iterable[Spec]) -> Spec:
-    """Rows below each other, with the fonts and lines of every chart of the app."""
-    return {
-        "$schema": SCHEMA,
-        "vconcat": list(rows),
-        "spacing": 6,
-        "usermeta": {"embedOptions": {"renderer": "svg", "actions": False}},
-        "config": look(),
-    }
+def coded(field: str, kind: str, **more: Any) -> Spec:
+    """A field of a table along an axis, or as a colour."""
+    return {"field": field, "type": kind, **more}
 
 
-def look() -> Spec:
-    """Fonts and lines of the charts."""
-    return {
+def described(renderer: str = "svg", **parts: Any) -> Spec:
+    """A whole chart, with the fonts and lines of every chart of the app."""
+    config = {
         "font": FONT,
         "view": {"stroke": "#CCCCCC"},
         "axis": {"gridColor": "#EEEEEE", "titleFontWeight": "normal"},
         "title": {"fontSize": 11, "fontWeight": "normal"},
     }
+    options = {"embedOptions": {"renderer": renderer, "actions": False}}
+    return {"$schema": SCHEMA, **parts, "usermeta": options, "config": config}

@@ -5,16 +5,14 @@
 
 from __future__ import annotations
 
-import string
 from pathlib import Path
 
 import numpy as np
 
 from figures import style
-from figures.page import LARGEST, TEMPLATE
+from figures.page import write_sections
 from jaxmpc import html
 from jaxmpc.errors import InputError
-from jaxmpc.files import write_atomically
 from jaxmpc.html import Markup, escape
 from jaxmpc.model.identification import Identification, Record
 
@@ -57,20 +55,13 @@ def write_page(found: Identification, path: str | Path) -> Path:
         parts += [f"<p>{left} more are not shown.</p>"] if left else []
         sections.append(("records", "What was measured, and what the model makes of it", "".join(parts)))
     sections += [("notes", "Notes", _listed(found.notes)), ("origin", "Where it comes from", _origin(found))]
+    about = Markup(
+        f"Responses to {escape(inputs)}: {model.samples} samples of {model.dt:g} s. Worst verdict: "
+        f"<strong>{found.worst}</strong>."
+    )
+    refused = InputError("page", str(path), "a page of 10 MB at most", "Identify fewer pairs at once")
     sections = [one for one in sections if one[2]]
-    blanks = {
-        "title": f"Model of {escape(', '.join(model.cv_names))}",
-        "about": f"Responses to {escape(inputs)}: {model.samples} samples of {model.dt:g} s. Worst verdict: "
-        f"<strong>{found.worst}</strong>.",
-        "contents": "\n".join(f'<li><a href="#{key}">{title}</a></li>' for key, title, _ in sections),
-        "body": "\n".join(
-            f'<section id="{key}">\n<h2>{title}</h2>\n{body}\n</section>' for key, title, body in sections
-        ),
-    }
-    page = string.Template(TEMPLATE.read_text(encoding="utf-8")).substitute(blanks)
-    if len(page.encode()) > LARGEST:
-        raise InputError("page", str(path), "a page of 10 MB at most", "Identify fewer pairs at once")
-    return write_atomically(path, page)
+    return write_sections(path, f"Model of {', '.join(model.cv_names)}", about, sections, refused)
 
 
 def _listed(lines: tuple[str, ...]) -> str:

@@ -5,7 +5,6 @@ The page is one file that needs nothing else: pictures are embedded, and there i
 
 from __future__ import annotations
 
-import html
 import string
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from figures import style
 from figures.figure import FigureEntry
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
+from jaxmpc.html import escape
 
 PAGE = "index.html"
 TEMPLATE = Path(__file__).with_name("page.html")
@@ -49,21 +49,36 @@ def write_page(
         if not picture.is_file():
             expected = f"the picture of figure {entry.id}"
             raise InputError("out", str(picture), expected, "Draw the figures first")
-    contents = [
-        f'<li><a href="#figure-{html.escape(entry.id)}">{html.escape(heading(entry))}</a></li>'
-        for entry, _ in shown
-    ]
     sections = [
-        _section(entry, picture.read_bytes(), data, command(entry))
+        (f"figure-{entry.id}", heading(entry), _body(entry, picture.read_bytes(), data, command(entry)))
         for (entry, data), picture in zip(shown, pictures, strict=True)
     ]
-    blanks = {"contents": "\n".join(contents), "body": "\n".join(sections)}
-    blanks |= {"title": html.escape(title), "about": html.escape(about)}
+    ids = [entry.id for entry, _ in shown]
+    refused = InputError("figure", ids, "figures of 10 MB together", "Ask for fewer of them")
+    return write_sections(Path(folder) / PAGE, title, about, sections, refused)
+
+
+def write_sections(
+    path: str | Path, title: str, about: str, sections: Sequence[tuple[str, str, str]], too_large: InputError
+) -> Path:
+    """Write a page of sections, each of an id, a heading and what stands below it as HTML, behind a list of them.
+
+    Raises:
+        InputError: `too_large`, before anything is written.
+    """
+    found = [(escape(id), escape(words), body) for id, words, body in sections]
+    blanks = {
+        "title": escape(title),
+        "about": escape(about),
+        "contents": "\n".join(f'<li><a href="#{id}">{words}</a></li>' for id, words, _ in found),
+        "body": "\n".join(
+            f'<section id="{id}">\n<h2>{words}</h2>\n{body}\n</section>' for id, words, body in found
+        ),
+    }
     page = string.Template(TEMPLATE.read_text(encoding="utf-8")).substitute(blanks)
     if len(page.encode()) > LARGEST:
-        ids = [entry.id for entry, _ in shown]
-        raise InputError("figure", ids, "figures of 10 MB together", "Ask for fewer of them")
-    return write_atomically(Path(folder) / PAGE, page)
+        raise too_large
+    return write_atomically(path, page)
 
 
 def heading(entry: FigureEntry) -> str:
@@ -71,20 +86,17 @@ def heading(entry: FigureEntry) -> str:
     return f"Figure {entry.id}: {entry.title}" if entry.id.isdigit() else entry.title.capitalize()
 
 
-def _section(entry: FigureEntry, picture: bytes, data: xr.Dataset | None, command: str) -> str:
+def _body(entry: FigureEntry, picture: bytes, data: xr.Dataset | None, command: str) -> str:
     study = "none: computed from the problem itself"
     if data is not None:
         study = f"{data.attrs.get('study', entry.study)} ({data.attrs.get('title', '')})"
-    again = f"\n<dt>Again</dt><dd><code>{html.escape(command)}</code></dd>" if command else ""
-    return f"""<section id="figure-{html.escape(entry.id)}">
-<h2>{html.escape(heading(entry))}</h2>
-<figure>
+    again = f"\n<dt>Again</dt><dd><code>{escape(command)}</code></dd>" if command else ""
+    return f"""<figure>
 {style.image(picture, entry.alt)}
-<figcaption>{html.escape(entry.text(data))}</figcaption>
+<figcaption>{escape(entry.text(data))}</figcaption>
 </figure>
 <dl>
-<dt>Study</dt><dd>{html.escape(study)}</dd>
-<dt>Drawn by</dt><dd><code>{html.escape(entry.source)}</code></dd>{again}
+<dt>Study</dt><dd>{escape(study)}</dd>
+<dt>Drawn by</dt><dd><code>{escape(entry.source)}</code></dd>{again}
 </dl>
-<p class="up"><a href="#contents">Contents</a></p>
-</section>"""
+<p class="up"><a href="#contents">Contents</a></p>"""

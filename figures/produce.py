@@ -1,12 +1,21 @@
-"""Figures from nothing: the studies that they need are run if their results are missing, then all are drawn."""
+"""Figures from nothing: the studies that they need are run if their results are missing, then all are drawn.
+
+`write_gallery` puts what was drawn on one HTML page.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import xarray as xr
+
+from figures.figure import FigureEntry
+from figures.page import write_page
 from figures.registry import FIGURES, check_ids, draw
+from figures.thesis.facts import about
 from studies.run.comparison import is_current as stored_as
+from studies.store.reading import open_results
 from studies.store.writing import check_writable
 from studies.thesis import catalogue
 
@@ -48,6 +57,37 @@ def produce(
             folders[study] = catalogue.run_thesis(study, results, quick, plant, say=say)
     drawn = [draw([id for id in ids if FIGURES[id].study == study], folders[study], out) for study in studies]
     return [path for paths in drawn for path in paths]
+
+
+def write_gallery(
+    ids: Iterable[str] = ("all",),
+    results: str | Path = "results",
+    out: str | Path = "figures-out",
+    quick: bool = False,
+    plant: str = catalogue.PLANTS[0],
+) -> Path:
+    """Write one HTML page, ``index.html``, beside the figures that `produce` has drawn with the same arguments.
+
+    The captions take their numbers from the results.
+
+    Returns:
+        The page.
+
+    Raises:
+        InputError: for an unknown id, a figure or results that are missing, or a page of more than 10 MB; before
+            anything is written.
+    """
+    entries = [FIGURES[id] for id in check_asked(ids, quick, plant)]
+    read: dict[str | None, xr.Dataset | None] = {None: None}
+    for study in filter(None, dict.fromkeys(entry.study for entry in entries)):
+        read[study] = open_results(study_folder(study, results, quick, plant)).load()
+    options = (" --quick" if quick else "") + (f" --plant {plant}" if plant != catalogue.PLANTS[0] else "")
+
+    def command(entry: FigureEntry) -> str:
+        return f"jaxmpc figures {entry.id}{options if entry.study else ''}"
+
+    shown = [(entry, read[entry.study]) for entry in entries]
+    return write_page(shown, out, "Figures", about(quick, plant), command)
 
 
 def check_asked(ids: Iterable[str], quick: bool, plant: str) -> list[str]:

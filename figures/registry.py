@@ -1,6 +1,6 @@
 """Every figure of the thesis by its id, those of any comparison, and drawing them; the modules that draw have the entries.
 
-The command line (`jaxmpc figures`, `jaxmpc study run` of a comparison), `figures.produce` and `figures.gallery` call it.
+The command line (`jaxmpc figures`, `jaxmpc study run` of a comparison) and `figures.produce` call it.
 """
 
 from __future__ import annotations

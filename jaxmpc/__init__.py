@@ -30,7 +30,7 @@ _watch()
 _HOME_OF = {
     "Actuator": "process.actuator",
     "Controller": "controller.controller",
-    "Controllers": "controller.controller",
+    "Controllers": "controller.batch",
     "Event": "loop.events",
     "FunctionPlant": "process.function_plant",
     "InputError": "errors",

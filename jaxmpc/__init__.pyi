@@ -1,9 +1,9 @@
 """What type checkers and editors see of the package, whose names are loaded when first used."""
 
+from jaxmpc.controller.batch import Controllers as Controllers
 from jaxmpc.controller.checkpoint import load_controller as load_controller
 from jaxmpc.controller.checkpoint import save_controller as save_controller
 from jaxmpc.controller.controller import Controller as Controller
-from jaxmpc.controller.controller import Controllers as Controllers
 from jaxmpc.controller.measurement import SensorFault as SensorFault
 from jaxmpc.controller.measurement import fault_errors as fault_errors
 from jaxmpc.controller.plan import solve_plan as solve_plan

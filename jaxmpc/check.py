@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.errors import InputError
+from jaxmpc.errors import InputError, near
 
 LARGEST = 1e30  # size of a number from which on it cannot be meant, and products of squares overflow
 
@@ -48,6 +48,17 @@ def require(met: object, path: str, value: object, expected: str, hint: str = ""
     """Go on if a condition is met, else raise an `InputError` of these fields."""
     if not met:
         raise InputError(path, value, expected, hint)
+
+
+def among(path: str, name: Any, known: Iterable[str], expected: str = "one of", *given: Any) -> None:
+    """Refuse a name that is not known; the known ones follow what is expected, and close ones are the hint.
+
+    Args:
+        given: the value that is shown, where that is not the name.
+    """
+    known = list(known)
+    if name not in known:
+        raise InputError(path, (*given, name)[0], f"{expected} {', '.join(known)}", near(name, known))
 
 
 @contextlib.contextmanager

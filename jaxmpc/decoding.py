@@ -51,6 +51,9 @@ def decode(
             value = value[key] if key else value[int(index)]
             path = _below(path, key) if key else f"{path}[{index}]"
             struct = _fields(struct)[key] if key else struct
+        if isinstance(refused := error.__cause__, InputError):  # by the type itself
+            at = _below(path, refused.field)
+            raise InputError(at, refused.value, refused.expected, refused.hint) from None
         told = lambda at, words: expected(re.sub(r"\[\d+\]", "", at), words)  # noqa: E731
         if found := re.search(r"unknown field `(.*)`", message):
             names = list(_fields(struct))

@@ -14,7 +14,7 @@ import secrets
 import stat
 import tempfile
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -191,7 +191,7 @@ def check_target(field: str, path: str | Path, inputs: Iterable[str | Path] = ()
         InputError: naming the path and the reason.
     """
     path = Path(path)
-    try:
+    with _writable(field, path, "file"):
         known = _status(path)
         if known is not None:
             _refuse_kind(path, known)
@@ -199,18 +199,22 @@ def check_target(field: str, path: str | Path, inputs: Iterable[str | Path] = ()
             _refuse_input(path, known, Path(given))
         if known is None or stat.S_ISREG(known.st_mode):
             _probe(Path(os.path.realpath(path)))
-    except (OSError, ValueError) as error:  # ValueError: a null character in the name
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(field, str(path), f"a file that can be written ({reason})") from None
 
 
 def check_folder(field: str, path: str | Path) -> None:
     """Refuse a folder in which no file could be written later; nothing is made; arguments and errors of `check_target`."""
-    try:
+    with _writable(field, path, "folder"):
         _probe(Path(os.path.realpath(path)) / "file")
-    except (OSError, ValueError) as error:
+
+
+@contextlib.contextmanager
+def _writable(field: str, path: str | Path, what: str) -> Iterator[None]:
+    """Make an `InputError` of what the system refuses."""
+    try:
+        yield
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
         reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(field, str(path), f"a folder that can be written ({reason})") from None
+        raise InputError(field, str(path), f"a {what} that can be written ({reason})") from None
 
 
 def _status(path: Path) -> os.stat_result | None:

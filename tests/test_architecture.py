@@ -84,6 +84,7 @@ SOLVES = {  # figures read results: nothing that predicts, solves or simulates
     "jaxmpc.relaxed",
     "jaxmpc.integer",
     "jaxmpc.controller.plan",
+    "jaxmpc.controller.batch",
     "jaxmpc.controller.controller",
     "jaxmpc.controller.core",
     "jaxmpc.process.well.plant",

@@ -228,18 +228,8 @@ def setting(data: xr.Dataset, key: str) -> Any:
 
 def default_setting(process: Process, key: str, preset: str | None = None) -> Any:
     """Value of a key where a study names at most a preset; None where nothing fixes it."""
-    section, _, rest = key.partition(".")
-    field, _, channel = rest.partition(".")
-    if section == "tuning" and channel:
-        names = process.cv_names if channel in process.cv_names else process.mv_names
-        values = getattr(process.tuning(process.structure(), preset), field, None)
-        return (
-            float(np.asarray(values)[names.index(channel)])
-            if values is not None and channel in names
-            else None
-        )
-    fields = study_fields(process, ())
-    return fields[key].default if key in fields else None
+    field = study_fields(process, ()).get(key)
+    return None if field is None else field.held(process, process.tuning(process.structure(), preset))
 
 
 def default_tuning(data: xr.Dataset) -> np.ndarray:

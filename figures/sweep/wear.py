@@ -26,6 +26,7 @@ from figures.sweep.data import (
     shown_mv,
     sweep_axes,
 )
+from jaxmpc.check import among
 from jaxmpc.errors import InputError
 from studies.kpi.objectives import unbeaten
 from studies.store.process import process_in
@@ -150,8 +151,7 @@ def _figure(data: xr.Dataset, name: str, cv: str | None) -> tuple[np.ndarray, st
             return values.mean("cv", skipna=False).values, f"{words}, mean of the CVs [{style.unit(units)}]"
         rest = style.unit(units.replace("cv_unit", "").strip() or "1")
         return deviation(data, name=name).values, f"{_TITLES.get(name, words)} / {SETTLED} [{rest}]"
-    if cv not in data.cv.values:
-        raise InputError("cv", cv, f"one of {', '.join(map(str, data.cv.values))}")
+    among("cv", cv, map(str, data.cv.values))
     shown = units.replace("cv_unit", str(data.cv_unit.sel(cv=cv).item()))
     return values.sel(cv=cv).values, f"{words}, {process_in(data).labels[cv]} [{style.unit(shown)}]"
 

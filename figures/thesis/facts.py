@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
 import xarray as xr
 
-from studies.kpi import loop as kpi
 from studies.thesis.catalogue import PLANTS
-from studies.thesis.well import CHOKE, GAS, OIL
-
-LATE = 600.0  # s at the end of a stretch that stand for what it settles at
+from studies.thesis.claims.record import late_deviation
+from studies.thesis.reach import turns
+from studies.thesis.well import GAS, OIL
 
 
 def about(quick: bool, plant: str) -> str:
@@ -27,25 +25,9 @@ def oil_first(data: xr.Dataset) -> xr.Dataset:
     return data.sel(cv=[OIL, GAS])
 
 
-def choke_moves(data: xr.Dataset, controller: str) -> np.ndarray:
-    """Moves of the actual choke position, ``"sample"`` [%]; none in the first sample of a part of a run."""
-    run = data.sel(controller=controller, mv=CHOKE)
-    position = run.position.values
-    whole = float(data.time.values[0]) == 0.0
-    start = run.demand.values[0] - run.move.values[0] if whole else position[0]  # as in the key figures
-    return np.asarray(kpi.moves_of(position, start))
-
-
 def reversals(data: xr.Dataset, controller: str) -> int:
     """How often the choke reverses."""
-    return int(np.asarray(kpi.reversal_events(choke_moves(data, controller))).sum())
-
-
-def turns(data: xr.Dataset, controller: str, segment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Choke reversals within each segment, ``"time"``, and the position of the choke [%]."""
-    position = data.position.sel(controller=controller, mv=CHOKE).values
-    move = np.diff(position, prepend=position[:1])
-    return np.asarray(kpi.reversal_events(move, segment=segment)), position
+    return int(turns(data.sel(controller=controller)).sum())
 
 
 def times(count: int) -> str:
@@ -54,7 +36,6 @@ def times(count: int) -> str:
 
 
 def settled(data: xr.Dataset, controller: str) -> dict[str, float]:
-    """Mean deviation from the setpoint in the last `LATE` seconds, by CV [CV unit]."""
-    run = data.sel(controller=controller)
-    away = (run.measurement - run.setpoint).isel(time=data.time.values > data.time.values[-1] - LATE)
-    return {str(cv): float(away.sel(cv=cv).mean()) for cv in away.cv.values}
+    """`late_deviation` of a run by CV [CV unit]."""
+    away = late_deviation(data.sel(controller=controller)).tolist()
+    return dict(zip(map(str, data.cv.values), away, strict=True))

@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 from figures import panels, style
 from figures.figure import FigureEntry
 from figures.planned import BEFORE, draw_plan, index_of
-from figures.thesis.facts import oil_first, turns
+from figures.thesis.facts import oil_first
 from jaxmpc.errors import InputError
 from studies.plans import StoredPlan, plan_at
-from studies.thesis.reach import NEAR_CLOSED
+from studies.thesis.reach import NEAR_CLOSED, turns
 from studies.thesis.well import CHOKE, GAS, LIFT, OIL
 
 SWING = (300.0, 600.0)  # s, at least, to show before and after the moves of an oscillation
@@ -81,8 +81,9 @@ def swing_moves(data: xr.Dataset, controller: str) -> tuple[float, float, float]
         InputError: if the choke turns back fewer than three times in every window.
     """
     window = data.window.values
-    turn, position = turns(data, controller, window)
-    near = turn & (position < NEAR_CLOSED)
+    run = data.sel(controller=controller)
+    turn = turns(run, window)
+    near = turn & (run.position.sel(mv=CHOKE).values < NEAR_CLOSED)
     turn = near if np.bincount(window, weights=near).max() >= 3 else turn
     at = np.flatnonzero(turn & (window == np.bincount(window, weights=turn).argmax()))
     if len(at) < 3:

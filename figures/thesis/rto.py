@@ -17,15 +17,14 @@ from matplotlib.figure import Figure
 from figures import panels, style
 from jaxmpc.errors import InputError
 from studies.store.reading import open_results, provenance
+from studies.thesis.rto import SETTLED, WITH, WITHOUT
 from studies.thesis.well import CHOKE, GAS, LIFT, OIL
 
-PLAIN, TARGETED = "without-rto", "with-rto"
 CURVES = {
-    PLAIN: {"label": "without RTO", "color": style.GREEN},
-    TARGETED: {"label": "with RTO", "color": style.PURPLE},
+    WITHOUT: {"label": "without RTO", "color": style.GREEN},
+    WITH: {"label": "with RTO", "color": style.PURPLE},
 }
 FORBIDDEN = "#F6DDD3"
-SETTLED = 30  # samples at the end of a window whose mean is where the run has settled
 
 
 @style.house_style
@@ -41,8 +40,8 @@ def draw(data: xr.Dataset) -> Figure:
     seconds = panels.time_axis(gas, *panels.span(data))
     for ax, mv in ((lift, LIFT), (choke, CHOKE)):
         panels.compared(ax, data, mv, CURVES, seconds)
-        target = data.target.sel(controller=TARGETED, mv=mv)
-        panels.dashed(ax, data, target, seconds, "ideal value", CURVES[TARGETED]["color"])
+        target = data.target.sel(controller=WITH, mv=mv)
+        panels.dashed(ax, data, target, seconds, "ideal value", CURVES[WITH]["color"])
         panels.limits(ax, data.position.sel(mv=mv), data.target.sel(mv=mv))
     _shade(lift, ranges)
     lift.set_ylim(bottom=0.0)
@@ -88,10 +87,10 @@ def _map(axes: Axes, data: xr.Dataset, ranges: list[list[float]]) -> None:
         axes.clabel(lines, fontsize=6.5, fmt="%.0f")
         label = f"steady {panels.label_of(data, cv)}"
         axes.plot([], [], color=colour, linewidth=0.7, linestyle=line, label=label)
-    window = data.window.values
+    window, settled = data.window.values, round(SETTLED / float(data.attrs["dt"]))
     for (name, curve), mark, side in zip(CURVES.items(), "oD", (-1, 1), strict=True):
         run = data.position.sel(controller=name).values
-        ends = np.array([run[window == w][-SETTLED:].mean(axis=0) for w in np.unique(window)])
+        ends = np.array([run[window == w][-settled:].mean(axis=0) for w in np.unique(window)])
         colour, label = curve["color"], f"settled, {curve['label']}"
         look: dict[str, Any] = {"markersize": 7, "markeredgecolor": "white", "zorder": 4}
         axes.plot(*ends.T, mark, label=label, color=colour, **look)
@@ -114,6 +113,6 @@ def _rate(axes: Axes, data: xr.Dataset, cv: str, seconds: float) -> None:
     for name, curve in CURVES.items():
         panels.measured(axes, data, name, cv, seconds, color=curve["color"], label="_measured")
     panels.dashed(axes, data, demanded, seconds, "demand and its deadzone")
-    wanted = data.setpoint.sel(controller=TARGETED, cv=cv)
-    panels.dashed(axes, data, wanted, seconds, "setpoint of the RTO", CURVES[TARGETED]["color"])
+    wanted = data.setpoint.sel(controller=WITH, cv=cv)
+    panels.dashed(axes, data, wanted, seconds, "setpoint of the RTO", CURVES[WITH]["color"])
     panels.limits(axes, data.measurement.sel(cv=cv), demanded - half, demanded + half)

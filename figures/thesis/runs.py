@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from figures import panels, style
 from figures.figure import FigureEntry
 from figures.panels import between
-from figures.thesis.facts import choke_moves, reversals, times, turns
+from figures.thesis.facts import reversals, times
 from jaxmpc.errors import InputError
 from studies.kpi import loop as kpi
-from studies.thesis.reach import NEAR_CLOSED
+from studies.thesis.reach import NEAR_CLOSED, choke_moves, turns
 from studies.thesis.well import CHOKE, GAS, LIFT, OIL
 
 SMOOTH, ROUNDED, INTEGER, HARD = "continuous-choke", "step-choke", "mixed-integer", "no-soft"
@@ -85,8 +85,8 @@ def oscillating_stretch(data: xr.Dataset, controller: str) -> tuple[float, float
     The window is the one with most choke reversals below 50 % there; an `InputError` if the choke never reverses there.
     """
     late = kpi.second_halves(data.window.values)
-    event, position = turns(data, controller, late)
-    event = event & (position < NEAR_CLOSED)
+    run = data.sel(controller=controller)
+    event = turns(run, late) & (run.position.sel(mv=CHOKE).values < NEAR_CLOSED)
     counts = np.asarray(kpi.count_by_segment(event, late, int(late.max()) + 1))
     if counts.max() == 0:
         expected = f"a run whose choke reverses below {NEAR_CLOSED:.0f} % in some window"
@@ -125,7 +125,7 @@ def _inputs_caption(data: xr.Dataset, controller: str) -> str:
     run = data.sel(controller=controller)
     choke = run.position.sel(mv=CHOKE)
     return (
-        f"The choke travels {np.abs(choke_moves(data, controller)).sum():.0f} % between {choke.min().item():.0f} and "
+        f"The choke travels {np.abs(choke_moves(run)).sum():.0f} % between {choke.min().item():.0f} and "
         f"{choke.max().item():.0f} % and reverses {times(reversals(data, controller))}; the lift travels "
         f"{np.abs(run.move.sel(mv=LIFT)).sum().item():,.0f} m³/h."
     )

@@ -27,8 +27,7 @@ def draw(options: Options) -> int:
             print(f"{id:>8}  {entry.title}  ({entry.study or 'no study'})")
         return EXIT_OPTIMAL
     check_folder("--out", options.out)
-    from figures.gallery import write_gallery
-    from figures.produce import produce
+    from figures.produce import produce, write_gallery
 
     asked = {"results": options.results, "out": options.out, "quick": options.quick, "plant": options.plant}
     for path in produce(options.ids, **asked):

@@ -24,6 +24,7 @@ def controller(options: Options) -> int:
     check_fmu_target("--out", options.out)
     from identify.plants import model_of
     from identify.step_test import settling_notes
+    from jaxmpc.check import located
     from jaxmpc.controller.controller import Controller
     from jaxmpc.process.file import load_process
 
@@ -32,10 +33,9 @@ def controller(options: Options) -> int:
     if integer and not process.stepped:
         expected = f"continuous: every MV of {process.name} takes all values"
         raise InputError("--controller", options.controller, expected)
-    if options.preset is not None and options.preset not in process.presets:
-        raise InputError("--preset", options.preset, f"one of {', '.join(process.presets)}")
     structure = process.structure(integer=integer)
-    tuning = process.tuning(structure, options.preset)
+    with located(lambda _: "--preset"):
+        tuning = process.tuning(structure, options.preset)
     model = model_of(process)
     for note in settling_notes(model):
         print(f"jaxmpc: {note}", file=sys.stderr)

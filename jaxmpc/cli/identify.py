@@ -8,7 +8,7 @@ from pathlib import Path
 from jaxmpc.cli.identify_data import DATA_OPTIONS, identify_data
 from jaxmpc.cli.identify_fmu import FMU_OPTIONS, identify_fmu
 from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, choice, command, named_number, option
-from jaxmpc.errors import InputError, near
+from jaxmpc.errors import InputError
 from jaxmpc.files import check_target
 
 
@@ -113,6 +113,7 @@ def _identify_process(options: Options) -> int:
     check_target("--out", options.out)
     from identify.plants import closing, identified, open_plant
     from identify.step_test import settling_notes
+    from jaxmpc.check import among
     from jaxmpc.process.file import DEFAULT_PROCESS, load_process
 
     process = load_process(options.source or DEFAULT_PROCESS)
@@ -122,10 +123,7 @@ def _identify_process(options: Options) -> int:
     )
     for name, given in (("--at", point), ("--step", steps)):
         for mv in given:
-            if mv not in process.mv_names:
-                raise InputError(
-                    name, mv, f"an MV: {', '.join(process.mv_names)}", near(mv, process.mv_names)
-                )
+            among(name, mv, process.mv_names, "an MV:")
     with closing(open_plant(process, options.plant or "", actual=False)) as plant:
         model = identified(process, plant, point, steps, options.samples)
     for note in settling_notes(model):

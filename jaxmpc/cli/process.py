@@ -55,9 +55,7 @@ def new(options: Options) -> int:
     from jaxmpc.process.new import new_process
 
     out: Path = options.out or options.model.with_suffix(".toml")
-    check_target("--out", out)
-    if out.exists():
-        raise InputError("--out", str(out), "a file that does not exist yet: yours is not overwritten")
+    _check_new(out)
     model = StepResponseModel.load(options.model)
     name = _named(out.stem)
     file = _relative(options.model, out.parent)
@@ -90,9 +88,7 @@ def _new_from_septic(options: Options) -> int:
     out: Path = options.out or folder / f"{_named(options.septic.resolve().stem)}.toml"
     model_file, page = out.with_suffix(".json"), out.with_name(f"{out.stem}-septic.md")
     for target in (out, model_file, page):
-        check_target("--out", target)
-        if target.exists():
-            raise InputError("--out", str(target), "a file that does not exist yet: yours is not overwritten")
+        _check_new(target)
     steps = dict(named_number("--step", text) for text in options.step or ())
     choices = Choices(options.application, options.weights or "span", steps, tuple(options.on_off or ()))
     made = read_application(options.septic, model_file.name, _named(out.stem), asked_in(options), choices)
@@ -135,6 +131,13 @@ def export(options: Options) -> int:
     print(*files, sep="\n")
     print(*report.summary(), *report.notes, sep="\n  ")
     return EXIT_OPTIMAL
+
+
+def _check_new(target: Path) -> None:
+    """Refuse a file that could not be written, or that is there already."""
+    check_target("--out", target)
+    if target.exists():
+        raise InputError("--out", str(target), "a file that does not exist yet: yours is not overwritten")
 
 
 def _named(stem: str) -> str:
@@ -212,14 +215,9 @@ def keys(options: Options) -> int:
 
     process = load_process(options.process)
     tuning = process.tuning(process.structure())
-    at = {name: i for names in (process.cv_names, process.mv_names) for i, name in enumerate(names)}
     rows = [("key", "unit", "default", "meaning")]
     for key, field in study_fields(process, parameters_of(process, options.plant)).items():
-        given = field.default
-        if given is None and key.startswith("tuning."):
-            name, _, channel = key.removeprefix("tuning.").partition(".")
-            given = getattr(tuning, name)
-            given = float(given[at[channel]] if channel else given)
+        given = field.held(process, tuning)
         given = "" if given is None else given
         rows.append((key, field.unit, given if isinstance(given, str) else as_text(given), field.label))
     wide = [max(len(str(row[i])) for row in rows) for i in range(3)]

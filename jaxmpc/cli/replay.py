@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from jaxmpc.cli.options import EXIT_OPTIMAL, EXITS, Options, command, option
-from jaxmpc.errors import InputError
 from jaxmpc.files import check_folder
 
 KINDS = ("mixed-integer", "continuous")
@@ -24,8 +23,10 @@ KINDS = ("mixed-integer", "continuous")
 )
 def replay(options: Options) -> int:
     """Say what a controller would have advised at every sample of a log, beside what was done."""
-    if options.controller not in (None, *KINDS):
-        raise InputError("--controller", options.controller, f"one of {', '.join(KINDS)}")
+    from jaxmpc.check import among
+
+    if options.controller is not None:
+        among("--controller", options.controller, KINDS)
     check_folder("--out", options.out)
     from jaxmpc.process.file import load_process
     from jaxmpc.programs.compilation import is_quiet

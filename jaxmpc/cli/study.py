@@ -64,6 +64,7 @@ def run(options: Options) -> int:
             if (value := getattr(options, name)) is not None:
                 expected = f"a sweep study; {options.study} runs in one process"
                 raise InputError(f"--{name.replace('_', '-')}", value, expected)
+        check_folder("--out", options.out)
         return _study_alone(options) if options.study in ALONE else _study_comparison(options)
     if options.plant is not None:
         raise InputError(
@@ -72,13 +73,21 @@ def run(options: Options) -> int:
     return _study_sweep(options)
 
 
-def _study_alone(options: Options) -> int:
-    check_folder("--out", options.out)
+def _of_the_well(options: Options) -> tuple[Path, bool, str]:
+    """Where a study of the thesis goes, whether it is the quick one, and on which plant of the well."""
     if options.process is not None:
-        raise InputError(
-            "--process", options.process, f"nothing: {options.study} is of the well of the thesis"
-        )
-    asked = options.out, options.quick, options.plant or PLANTS[0]
+        expected = f"nothing: {options.study} is of the well of the thesis"
+        raise InputError("--process", options.process, expected)
+    return options.out, options.quick, options.plant or PLANTS[0]
+
+
+def _summed_up(folder: Path) -> int:
+    print(f"Summary: {folder / 'summary.md'}, figures: {folder / 'figures'}")
+    return EXIT_OPTIMAL
+
+
+def _study_alone(options: Options) -> int:
+    asked = _of_the_well(options)
     if options.study == "claims":
         from studies.thesis.claims_study import run_claims
 
@@ -89,12 +98,10 @@ def _study_alone(options: Options) -> int:
 
     folder = run_rto(*asked)
     draw_rto(folder)
-    print(f"Summary: {folder / 'summary.md'}, figures: {folder / 'figures'}")
-    return EXIT_OPTIMAL
+    return _summed_up(folder)
 
 
 def _study_comparison(options: Options) -> int:
-    check_folder("--out", options.out)
     from figures.registry import draw_study
     from studies.definition.catalogue import load_comparison
     from studies.thesis import catalogue
@@ -102,11 +109,7 @@ def _study_comparison(options: Options) -> int:
     if options.study in catalogue.STUDIES:
         from studies.thesis.report import write_thesis_summary
 
-        if options.process is not None:
-            raise InputError(
-                "--process", options.process, f"nothing: {options.study} is of the well of the thesis"
-            )
-        folder = catalogue.run_thesis(options.study, options.out, options.quick, options.plant or PLANTS[0])
+        folder = catalogue.run_thesis(options.study, *_of_the_well(options))
         draw_study(folder, options.study)
         write_thesis_summary(folder, options.study)
     else:
@@ -118,8 +121,7 @@ def _study_comparison(options: Options) -> int:
         folder = run_named(comparison, options.out)
         draw_study(folder, "comparison")
         write_summary(folder)
-    print(f"Summary: {folder / 'summary.md'}, figures: {folder / 'figures'}")
-    return EXIT_OPTIMAL
+    return _summed_up(folder)
 
 
 def _study_sweep(options: Options) -> int:

@@ -18,17 +18,16 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from jaxmpc.check import LARGEST, is_count, sound
+from jaxmpc.check import among
+from jaxmpc.controller.given import ARRAYS, check_position, checked_since, step_array
 from jaxmpc.decoding import decode
 from jaxmpc.errors import InputError
 from jaxmpc.files import write_atomically
 from jaxmpc.model.step_response import StepResponseModel, make_model
 from jaxmpc.problem.declared import declared
-from jaxmpc.problem.instance import DRIFT
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.problem.tuning import Tuning, make_tuning
-from jaxmpc.problem.values import neighbours
 from jaxmpc.relaxed.gap import check_gap, check_time_limit
 
 DEFAULT_GAP = 1e-6
@@ -109,13 +108,6 @@ class _CaseFields(msgspec.Struct, forbid_unknown_fields=True):
     limits: _LimitFields | None = None
 
 
-_ARRAYS = {  # unit, names of the columns, number of rows and what that is
-    "mv_now": ("MV unit", "mv_names", "", ""),
-    "last_move": ("MV unit", "mv_names", "", ""),
-    "free_response": ("CV unit", "cv_names", "prediction_horizon", "prediction_horizon"),
-    "setpoint": ("CV unit", "cv_names", "prediction_horizon", "prediction_horizon"),
-    "previous_moves": ("MV unit per sample", "mv_names", "block_count", "the number of blocks"),
-}
 _PLAIN_STRUCTURE = ("prediction_horizon", "control_horizon", "first_penalised", "blocking")
 _RARE = ("integer_values", "dwell", "integer_horizon")  # what few cases have
 _PLAN = (
@@ -130,7 +122,7 @@ _UNIT = {
     "limits.gap": "relative",
     **{f"structure.{key}": field.unit for key, field in declared(Structure).items()},
     **{f"tuning.{key}": field.unit for key, field in _IN_STEP.items()},
-    **{key: unit for key, (unit, *_) in _ARRAYS.items()},
+    **{key: unit for key, (unit, *_) in ARRAYS.items()},
 }
 
 
@@ -175,7 +167,7 @@ def make_case(body: Any) -> Case:
         model=model,
         structure=structure,
         tuning=make_tuning(structure, **_given(fields.tuning)),
-        **{key: step_array(key, getattr(fields, key), structure) for key in _ARRAYS},
+        **{key: step_array(key, getattr(fields, key), structure) for key in ARRAYS},
         samples_since_move=checked_since(structure, fields.samples_since_move),
         time_limit=check_time_limit("limits.time_s", limits.time_s),
         gap=check_gap("limits.gap", limits.gap),
@@ -211,7 +203,7 @@ def case_to_dict(case: Case) -> dict[str, Any]:
             **{key: values for key, values in rare.items() if values},
         },
         "tuning": _plain(tuning),
-        **{key: np.asarray(getattr(case, key)).tolist() for key in _ARRAYS if getattr(case, key) is not None},
+        **{key: np.asarray(getattr(case, key)).tolist() for key in ARRAYS if getattr(case, key) is not None},
         "limits": {"time_s": case.time_limit, "gap": case.gap},
     }
     if case.samples_since_move is not None:
@@ -303,8 +295,7 @@ def _given_blocks(given: Any, names: tuple[str, ...]) -> tuple[Any, ...]:
 
 
 def _check_mv(path: str, value: Any, name: str, names: tuple[str, ...]) -> None:
-    if name not in names:
-        raise InputError(path, value, f"one of the MV names {', '.join(names)}")
+    among(path, name, names, "one of the MV names", value)
 
 
 def _given_horizon(given: int | dict[str, Any], integer: dict[str, Any], names: tuple[str, ...]) -> tuple:
@@ -355,64 +346,3 @@ def _structure(fields: _StructureFields, model: StepResponseModel) -> Structure:
             fields.integer_horizon, {**fields.integer_step, **fields.integer_values}, model.mv_names
         ),
     )
-
-
-def step_array(path: str, given: Any, structure: Structure) -> Any:
-    """A finite vector with one entry per name, or a matrix of such rows, as many as it must have; None as it is."""
-    if given is None:
-        return None
-    given = np.asarray(given) if hasattr(given, "shape") else given
-    _, columns, count, why = _ARRAYS[path]
-    names = getattr(structure, columns)
-    numbers = f"{len(names)} numbers{_unit(path)}"
-    if count and len(given) != getattr(structure, count):
-        expected = f"{why} = {getattr(structure, count)} rows of {numbers}"
-        raise InputError(path, f"{len(given)} rows", expected)
-    for i, row in enumerate(given if count else [given]):
-        if np.size(row) != len(names):
-            raise InputError(f"{path}[{i}]" if count else path, row, f"{numbers} for {', '.join(names)}")
-    array = np.array(given, dtype=np.float64)
-    bad = np.argwhere(~sound(array))
-    if len(bad):
-        index = "".join(f"[{i}]" for i in bad[0])
-        expected = f"a finite number of size {LARGEST:g} at most{_unit(path)}"
-        raise InputError(path + index, float(array[tuple(bad[0])]), expected)
-    array.setflags(write=False)
-    return array
-
-
-def check_position(structure: Structure, tuning: Tuning, mv_now: np.ndarray) -> None:
-    """Refuse MVs outside their limits or off their lists: the closed-loop controller recovers, a single step cannot."""
-    low, high = np.asarray(tuning.mv_low), np.asarray(tuning.mv_high)
-    for i, name in enumerate(structure.mv_names):
-        now = float(mv_now[i])
-        drift = DRIFT * (structure.steps[i] or max(1.0, abs(now)))  # what MIP solvers leave over
-        if not low[i] - drift <= now <= high[i] + drift:
-            expected = f"mv_low[{i}] = {low[i]:g} to mv_high[{i}] = {high[i]:g} [MV unit] for {name}"
-            raise InputError(f"mv_now[{i}]", now, expected)
-    check_listed(structure, mv_now)
-
-
-def check_listed(structure: Structure, mv_now: np.ndarray) -> None:
-    """Refuse MVs that are not on one of their allowed values."""
-    for i, (name, values) in enumerate(zip(structure.mv_names, structure.integer_values, strict=False)):
-        now, drift = float(mv_now[i]), DRIFT * (structure.steps[i] or 1.0)
-        if values is not None and min(abs(now - value) for value in values) > drift:
-            near = " or ".join(f"{value:g}" for value in neighbours(values, now))
-            expected = f"a value of structure.integer_values.{name}, the nearest being {near} [MV unit]"
-            raise InputError(f"mv_now[{i}]", now, expected)
-
-
-def checked_since(structure: Structure, given: Any) -> tuple[int | None, ...] | None:
-    """Samples since the last move of every MV, None for long ago; None as it is."""
-    if given is None:
-        return None
-    names = ", ".join(structure.mv_names)
-    if np.ndim(given) != 1 or len(given) != structure.mv_count:
-        expected = f"{structure.mv_count} whole numbers [samples], null (None) for long ago, for {names}"
-        raise InputError("samples_since_move", given, expected)
-    for i, samples in enumerate(given):
-        if samples is not None and not is_count(samples):
-            expected = "a whole number of samples, 1 or more, or null (None) for long ago"
-            raise InputError(f"samples_since_move[{i}]", samples, expected)
-    return tuple(None if samples is None else int(samples) for samples in given)

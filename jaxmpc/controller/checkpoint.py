@@ -15,10 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.check import check_keys
+from jaxmpc.check import among, check_keys
 from jaxmpc.controller.controller import Controller
-from jaxmpc.controller.core import ControllerState
 from jaxmpc.controller.schedule import ModelSchedule, ScheduledController
+from jaxmpc.controller.state import ControllerState
 from jaxmpc.errors import InputError
 from jaxmpc.files import from_strict_json, read_json, strict_json, write_atomically
 from jaxmpc.model.step_response import StepResponseModel
@@ -99,8 +99,7 @@ KINDS = {"controller": Controller, "scheduled": ScheduledController}
 
 
 def _made(body: dict[str, Any]) -> Controller:
-    if body["kind"] not in KINDS:
-        raise InputError("controller.kind", body["kind"], f"one of {', '.join(KINDS)}")
+    among("controller.kind", body["kind"], KINDS)
     tuples: dict[str, Any] = {
         key: tuple(v) if isinstance(v, list) else v for key, v in body["structure"].items()
     }
@@ -122,8 +121,7 @@ def _restored(controller: Controller, saved: Any) -> ControllerState:
     wanted = _named(fresh)
     check_keys("controller.state", saved, wanted)
     for key in saved:
-        if key not in wanted:
-            raise InputError(f"controller.state.{key}", saved[key], f"one of {', '.join(wanted)}")
+        among(f"controller.state.{key}", key, wanted, "one of", saved[key])
     leaves = []
     for key, leaf in wanted.items():
         value = _numbers(f"controller.state.{key}", saved[key])

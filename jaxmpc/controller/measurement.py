@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxmpc.check import is_number
+from jaxmpc.check import among, is_number
 from jaxmpc.errors import InputError
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
@@ -112,10 +112,8 @@ def fault_errors(
     errors = np.zeros((samples, structure.cv_count))
     for i, fault in enumerate(faults):
         at, length = f"{path}[{i}]", samples * structure.dt
-        if fault.cv not in structure.cv_names:
-            raise InputError(f"{at}.cv", fault.cv, f"one of the CVs {', '.join(structure.cv_names)}")
-        if fault.kind not in FAULTS:
-            raise InputError(f"{at}.kind", fault.kind, f"one of {', '.join(FAULTS)}")
+        among(f"{at}.cv", fault.cv, structure.cv_names, "one of the CVs")
+        among(f"{at}.kind", fault.kind, FAULTS)
         if not is_number(fault.time) or not 0 <= fault.time < length:
             raise InputError(f"{at}.time", fault.time, f"a time within the run, 0 to less than {length:g} s")
         duration = structure.dt if fault.duration is None else fault.duration

@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike
 
 from jaxmpc import html
 from jaxmpc import status as codes
-from jaxmpc.controller.case import check_listed, check_position, checked_since, step_array
-from jaxmpc.controller.controller import Controllers, check_finish, known_of, one_lane
+from jaxmpc.controller.batch import Controllers, check_finish, known_of, one_lane
 from jaxmpc.controller.core import Core
+from jaxmpc.controller.given import check_listed, check_position, checked_since, step_array
 from jaxmpc.controller.sample import require_double_precision
 from jaxmpc.integer.actuators import LONG_AGO, Actuator, actuators_of, samples_since
 from jaxmpc.integer.finish import finish_steps

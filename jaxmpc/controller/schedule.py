@@ -30,10 +30,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxmpc.check import LARGEST, check_keys, is_count, is_number
+from jaxmpc.controller.batch import Batch
 from jaxmpc.controller.build import Scenarios
-from jaxmpc.controller.controller import Batch, Controller
-from jaxmpc.controller.core import ControllerState, Core, Moment, StepInfo
+from jaxmpc.controller.controller import Controller
+from jaxmpc.controller.core import Core, Moment
 from jaxmpc.controller.sample import Sample
+from jaxmpc.controller.state import ControllerState, StepInfo
 from jaxmpc.errors import InputError
 from jaxmpc.files import read_json, write_atomically
 from jaxmpc.model.step_response import StepResponseModel, advance_free_response, make_model

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxmpc.controller.controller import Batch, considered
+from jaxmpc.controller.batch import Batch, considered
 from jaxmpc.controller.core import Moment
 from jaxmpc.controller.measurement import received
 from jaxmpc.controller.sample import Sample

@@ -13,12 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from jaxmpc.controller.controller import Batch
+from jaxmpc.check import among
+from jaxmpc.controller.batch import Batch
 from jaxmpc.controller.core import without
 from jaxmpc.errors import InputError
 from jaxmpc.loop.interventions import checked_sample
 from jaxmpc.problem.structure import Structure
-from jaxmpc.problem.tuning import FIELDS, Tuning, make_tuning
+from jaxmpc.problem.tuning import Tuning, by_name, make_tuning
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +61,7 @@ def stages_of(
         InputError: naming the event and the field, for times outside the run or before the event before, unknown names, and
             tunings that do not hold together.
     """
-    fields, off = _fields(structure, tuning), {"cv": set(), "mv": set()}
+    fields, off = by_name(structure, tuning), {"cv": set(), "mv": set()}
     names = {"cv": structure.cv_names, "mv": structure.mv_names}
     flags = lambda kind: np.array([name in off[kind] for name in names[kind]])  # noqa: E731
     stages, now = [Stage(0, tuning, flags("mv"))], tuning
@@ -78,7 +79,7 @@ def stages_of(
             fields[field] = {**fields[field], **new} if part else new
         if event.tuning:
             tuning = make_tuning(structure, path=f"{at}.tuning", **fields)
-            fields = _fields(structure, tuning)
+            fields = by_name(structure, tuning)
         for kind, known in names.items():
             goes, comes = (
                 _names(f"{at}.{kind}_{way}", getattr(event, f"{kind}_{way}"), known) for way in ("off", "on")
@@ -97,22 +98,11 @@ def stages_of(
     return stages
 
 
-def _fields(structure: Structure, tuning: Tuning) -> dict[str, Any]:
-    """The fields of a tuning as `make_tuning` takes them, by name where there is one value per CV or MV."""
-    names = {"cv": structure.cv_names, "mv": structure.mv_names}
-    found = {}
-    for key, field in FIELDS.items():
-        values = np.asarray(getattr(tuning, key)).tolist()
-        found[key] = dict(zip(names[field.of], values, strict=True)) if field.of else values
-    return found
-
-
 def _names(path: str, given: Any, known: tuple[str, ...]) -> set[str]:
     if isinstance(given, str) or not isinstance(given, Sequence):
         raise InputError(path, given, f"a list of names among {', '.join(known)}")
     for name in given:
-        if name not in known:
-            raise InputError(path, name, f"names among {', '.join(known)}")
+        among(path, name, known, "names among")
     return set(given)
 
 

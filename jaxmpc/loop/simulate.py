@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from jaxmpc.controller.controller import Batch, Controller, Controllers
+from jaxmpc.controller.batch import Batch, Controllers
+from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
 from jaxmpc.loop.compiled import Inputs, simulate_compiled
 from jaxmpc.loop.events import Event

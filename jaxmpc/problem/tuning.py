@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from functools import partial
 from types import MappingProxyType
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -180,6 +181,15 @@ def within_values(structure: Structure, tuning: Tuning) -> Tuning:
     low, high = np.array(ends).T
     limits = jnp.maximum(tuning.mv_low, low), jnp.minimum(tuning.mv_high, high)
     return eqx.tree_at(lambda t: (t.mv_low, t.mv_high), tuning, limits)
+
+
+def by_name(structure: Structure, tuning: Tuning) -> dict[str, Any]:
+    """The fields of a tuning as `make_tuning` takes them, mappings by name where there is one value per CV or MV."""
+    names, found = {"cv": structure.cv_names, "mv": structure.mv_names}, {}
+    for key, field in FIELDS.items():
+        values = np.asarray(getattr(tuning, key)).tolist()
+        found[key] = dict(zip(names[field.of], values, strict=True)) if field.of else values
+    return found
 
 
 def stack_tunings(tunings) -> Tuning:

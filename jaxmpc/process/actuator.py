@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.check import is_number
-from jaxmpc.errors import InputError, near
+from jaxmpc.check import among, is_number
+from jaxmpc.errors import InputError
 
 KINDS = ("continuous", "stepped", "values", "on-off")
 TOLERANCE = 5e-10  # of a step, so that rounding in the demand does not cost a move
@@ -34,15 +34,12 @@ class Actuator:
     low: float = -math.inf  # the demand is limited to low..high; on-off: off and on
     high: float = math.inf
     step: float = 0.0  # stepped: between two positions, which are origin + k step
-    threshold: float | None = (
-        None  # stepped: how far off the demand must be for a move; half a step if not given
-    )
+    threshold: float | None = None  # stepped: how far off the demand must be; half a step if not given
     origin: float = 0.0  # stepped: one of the positions
     values: tuple[float, ...] = ()  # values: where it can stand
 
     def __post_init__(self):
-        if self.kind not in KINDS:
-            raise InputError("actuator.kind", self.kind, f"one of {', '.join(KINDS)}", near(self.kind, KINDS))
+        among("actuator.kind", self.kind, KINDS)
         object.__setattr__(self, "values", tuple(self.values))
         if any(math.isnan(limit) for limit in (self.low, self.high)) or not self.low < self.high:
             raise InputError("actuator.low", (self.low, self.high), "low below high [MV unit]")

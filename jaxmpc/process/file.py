@@ -11,124 +11,48 @@ import re
 from collections.abc import Mapping
 from importlib import resources, util
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 
-from jaxmpc.check import as_floats, is_number, located, require
+from jaxmpc.check import among, as_floats, is_number, located, require
 from jaxmpc.decoding import decode
-from jaxmpc.errors import near
 from jaxmpc.files import read_named_toml
-from jaxmpc.process.actuator import Actuator
-from jaxmpc.process.process import Cv, KeyFigure, ModelSource, Mv, PlantSource, Process, Variable
+from jaxmpc.process.process import Process
 from jaxmpc.process.reference import Reference
-from jaxmpc.process.responses import LONGEST, TransferFunctionSection, responses_of
+from jaxmpc.process.responses import responses_of
+from jaxmpc.process.variables import Cv, KeyFigure, ModelSource, Mv, PlantSource, Positive, Variable
 
 DEFAULT_PROCESS = "gas-lifted-well"  # of studies that name none
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 VARIABLE = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")  # of a CV, an MV, a disturbance or a key figure
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-Numbers = dict[str, float]
 
 
-class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A table of the file."""
-
-
-class VariableSection(Section, frozen=True):
-    """``[[disturbance]]``, and what CVs and MVs have of it."""
-
-    name: str
-    unit: str = "1"
-    label: str = ""  # the name in words, if not given
-    span: Positive = 1.0
-    tag: str = ""  # the name, if not given
-
-
-class CvSection(VariableSection, frozen=True):
-    """``[[cv]]``; see `jaxmpc.process.process.Cv`."""
-
-    low: float = -np.inf
-    high: float = np.inf
-    settled: float = 0.0  # a fiftieth of the span, if not given
-    setpoint_tag: str = ""
-
-
-class ActuatorSection(Section, frozen=True):
-    """``actuator = {...}`` of an MV; see `jaxmpc.process.actuator.Actuator`."""
-
-    kind: Literal["continuous", "stepped", "values", "on-off"]
-    step: Positive | None = None
-    threshold: Positive | None = None
-    origin: float = 0.0
-    values: tuple[float, ...] = ()
-
-
-class MvSection(VariableSection, frozen=True):
-    """``[[mv]]``; see `jaxmpc.process.process.Mv`."""
-
-    low: float = -np.inf
-    high: float = np.inf
-    move: Positive = np.inf
-    smallest_move: float | None = None  # a thousandth of the span, if not given
-    actuator: ActuatorSection = ActuatorSection("continuous")
-
-
-class PlantSection(Section, frozen=True):
-    """``[plants.NAME]``; see `jaxmpc.process.process.PlantSource`."""
-
-    kind: Literal["model", "jax", "fmu", "python"]
-    source: str = ""
-    options: dict[str, Any] = {}
-
-
-class ModelSection(Section, frozen=True):
-    """``[model]``; see `jaxmpc.process.process.ModelSource`."""
-
-    file: str = ""
-    transfer_functions: tuple[TransferFunctionSection, ...] = ()
-    working_point: Numbers = {}
-    steps: Numbers = {}
-    disturbance_steps: Numbers = {}
-    schedule: dict[str, tuple[float, ...]] = {}
-    samples: Annotated[int, msgspec.Meta(ge=1, le=LONGEST)] = 250
-
-
-class WindowsSection(Section, frozen=True):
+class WindowsSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[references.NAME]`` and ``[disturbances.NAME]``: rows of start [s] and one value per CV or disturbance."""
 
     windows: tuple[tuple[float, ...], ...]
     duration: Positive | None = None  # of a reference [s]
 
 
-class KeyFigureSection(Section, frozen=True):
-    """``[[key_figure]]``; see `jaxmpc.process.process.KeyFigure`."""
-
-    name: str
-    integral_of: str
-    unit: str
-    label: str = ""
-    per: Positive = 1.0
-
-
-class ProcessFile(Section, frozen=True):
+class ProcessFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The whole file."""
 
     name: str
     dt: Positive
-    cv: Annotated[tuple[CvSection, ...], msgspec.Meta(min_length=1)]
-    mv: Annotated[tuple[MvSection, ...], msgspec.Meta(min_length=1)]
+    cv: Annotated[tuple[Cv, ...], msgspec.Meta(min_length=1)]
+    mv: Annotated[tuple[Mv, ...], msgspec.Meta(min_length=1)]
     presets: dict[str, dict[str, Any]]
     references: dict[str, WindowsSection]
     title: str = ""
     source: str = ""
-    disturbance: tuple[VariableSection, ...] = ()
-    plants: dict[str, PlantSection] = msgspec.field(default_factory=lambda: {"model": PlantSection("model")})
-    model: ModelSection = ModelSection()
+    disturbance: tuple[Variable, ...] = ()
+    plants: dict[str, PlantSource] = msgspec.field(default_factory=lambda: {"model": PlantSource("model")})
+    model: ModelSource = ModelSource()
     structure: dict[str, Any] = {}
     disturbances: dict[str, WindowsSection] = {}
-    key_figure: tuple[KeyFigureSection, ...] = ()
+    key_figure: tuple[KeyFigure, ...] = ()
 
 
 def shipped_processes() -> dict[str, Path]:
@@ -168,28 +92,25 @@ def process_of(body: Any, folder: str | Path = ".", *, files: bool = True) -> Pr
     require(file.presets, "presets", {}, "one tuning or more, each headed [presets.NAME]")
     require(file.references, "references", {}, "one reference or more, each headed [references.NAME]")
     require(file.plants, "plants", {}, "one plant or more, each headed [plants.NAME]")
-    cvs = tuple(_cv(f"cv[{i}]", section) for i, section in enumerate(file.cv))
-    mvs = tuple(_mv(f"mv[{i}]", section) for i, section in enumerate(file.mv))
+    _check_model(file)
     process = Process(
         name=file.name,
         title=file.title or file.name.replace("-", " "),
         source=file.source,
         dt=file.dt,
-        cvs=cvs,
-        mvs=mvs,
-        disturbances=tuple(Variable(s.name, s.unit, _label(s), s.span, s.tag) for s in file.disturbance),
-        plants={name: PlantSource(s.kind, s.source, dict(s.options)) for name, s in file.plants.items()},
-        model=_model(file),
+        cvs=file.cv,
+        mvs=file.mv,
+        disturbances=file.disturbance,
+        plants=file.plants,
+        model=file.model,
         structure_fields=_structure_fields(file.structure),
         presets={name: _preset(file.presets, name) for name in file.presets},
         references={
-            name: windows_reference(f"references.{name}", section.windows, section.duration, cvs)
+            name: windows_reference(f"references.{name}", section.windows, section.duration, file.cv)
             for name, section in file.references.items()
         },
         courses={name: _course(name, s, len(file.disturbance)) for name, s in file.disturbances.items()},
-        key_figures=tuple(
-            KeyFigure(s.name, _label(s), s.unit, s.integral_of, s.per) for s in file.key_figure
-        ),
+        key_figures=file.key_figure,
         folder=str(folder),
         body=body,
     )
@@ -265,111 +186,33 @@ def _check_names(file: ProcessFile) -> None:
             seen[section.name] = path
     channels = [s.name for s in (*file.cv, *file.mv)]
     for i, section in enumerate(file.key_figure):
-        expected = f"a CV or an MV: {', '.join(channels)}"
-        require(
-            section.integral_of in channels, f"key_figure[{i}].integral_of", section.integral_of, expected
-        )
-    mvs, disturbances = [s.name for s in file.mv], [s.name for s in file.disturbance]
-    for name, values in file.model.schedule.items():
-        require(
-            name in mvs, f"model.schedule.{name}", values, f"one of the MVs {', '.join(mvs)}", near(name, mvs)
-        )
-    known_points = channels if file.model.transfer_functions else mvs
-    for table in ("working_point", "steps", "disturbance_steps"):
-        known = {"working_point": known_points, "disturbance_steps": disturbances}.get(table, mvs)
-        for name, value in getattr(file.model, table).items():
-            path = f"model.{table}.{name}"
-            require(name in known, path, value, f"one of {', '.join(known)}", near(name, known))
-            good = is_number(value) and (table == "working_point" or value != 0)
-            require(
-                good,
-                path,
-                value,
-                f"a finite number{'' if table == 'working_point' else ' other than 0'} [MV unit]",
-            )
+        among(f"key_figure[{i}].integral_of", section.integral_of, channels, "a CV or an MV:")
     for table in ("presets", "references", "plants", "disturbances"):
         for name in getattr(file, table):
             expected = "a letter, then up to 63 letters, digits, '-' and '_'"
             require(NAME.fullmatch(name), f"{table}.{name}", name, expected)
 
 
-def _model(file: ProcessFile) -> ModelSource:
-    """Where the model comes from."""
-    fields = msgspec.structs.asdict(file.model)
-    table = fields.pop("transfer_functions")
-    both = bool(table and file.model.file)
-    require(not both, "model.file", file.model.file, "nothing: model.transfer_functions are the model")
-    names = {key: [section.name for section in getattr(file, key)] for key in ("cv", "mv")}
-    loads = [f"output.{name}" for name in names["cv"]]
-    names["dv"] = [section.name for section in file.disturbance if section.name not in loads]
-    return ModelSource(responses=responses_of(table, names), **fields)
-
-
-def _label(section: Any) -> str:
-    return section.label or section.name.replace("_", " ")
-
-
-def _check_limits(path: str, section: Any) -> None:
-    unit = f"[{section.unit}]"
-    for field in ("low", "high"):
-        require(
-            not np.isnan(getattr(section, field)),
-            f"{path}.{field}",
-            getattr(section, field),
-            f"a number {unit}",
-        )
-    require(
-        section.low < section.high, f"{path}.low", section.low, f"less than high = {section.high:g} {unit}"
-    )
-
-
-def _cv(path: str, section: CvSection) -> Cv:
-    _check_limits(path, section)
-    settled = section.settled or section.span / 50
-    require(
-        settled > 0 and is_number(settled),
-        f"{path}.settled",
-        settled,
-        f"a half width above 0 [{section.unit}]",
-    )
-    return Cv(
-        section.name,
-        section.unit,
-        _label(section),
-        section.span,
-        section.tag,
-        section.low,
-        section.high,
-        settled,
-        section.setpoint_tag,
-    )
-
-
-def _mv(path: str, section: MvSection) -> Mv:
-    _check_limits(path, section)
-    smallest = section.span / 1000 if section.smallest_move is None else section.smallest_move
-    expected = f"0 or more [{section.unit}]"
-    require(is_number(smallest) and smallest >= 0, f"{path}.smallest_move", smallest, expected)
-    return Mv(
-        section.name,
-        section.unit,
-        _label(section),
-        section.span,
-        section.tag,
-        _actuator(f"{path}.actuator", section),
-        section.low,
-        section.high,
-        section.move,
-        smallest,
-    )
-
-
-def _actuator(path: str, section: MvSection) -> Actuator:
-    given = section.actuator
-    fields = {name: getattr(given, name) for name in ("step", "threshold", "values")}
-    fields = {name: value for name, value in fields.items() if value not in (None, ())}
-    with located(lambda field: f"{path}.{field.removeprefix('actuator').lstrip('.')}".rstrip(".")):
-        return Actuator(given.kind, low=section.low, high=section.high, origin=given.origin, **fields)
+def _check_model(file: ProcessFile) -> None:
+    """Refuse a model of two sources, and names of others than the variables of the process."""
+    source, cvs, mvs = file.model, [cv.name for cv in file.cv], [mv.name for mv in file.mv]
+    both = source.responses and source.file
+    require(not both, "model.file", source.file, "nothing: model.transfer_functions are the model")
+    disturbances = [disturbance.name for disturbance in file.disturbance]
+    loads = [f"output.{name}" for name in cvs]
+    responses_of(source.responses, {"cv": cvs, "mv": mvs, "dv": [d for d in disturbances if d not in loads]})
+    for name, values in source.schedule.items():
+        among(f"model.schedule.{name}", name, mvs, "one of the MVs", values)
+    for table, known, other in (
+        ("working_point", [*cvs, *mvs] if source.responses else mvs, ""),
+        ("steps", mvs, " other than 0"),
+        ("disturbance_steps", disturbances, " other than 0"),
+    ):
+        for name, value in getattr(source, table).items():
+            path = f"model.{table}.{name}"
+            among(path, name, known, "one of", value)
+            good = is_number(value) and (value != 0 or not other)
+            require(good, path, value, f"a finite number{other} [MV unit]")
 
 
 def _structure_fields(given: Mapping[str, Any]) -> dict[str, Any]:
@@ -390,7 +233,7 @@ def _preset(
     if base is None:
         return own
     path, known = f"presets.{name}.base", [other for other in presets if other not in (*seen, name)]
-    require(base in known, path, base, f"another preset that is not made of this one: {', '.join(known)}")
+    among(path, base, known, "another preset that is not made of this one:")
     return {**_preset(presets, base, (*seen, name)), **own}
 
 

@@ -15,8 +15,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxmpc.check import is_number
-from jaxmpc.errors import InputError, near
+from jaxmpc.check import among, is_number
+from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import StepResponseModel, shift_free_response
 from jaxmpc.process.actuator import Actuator, Actuators
 from jaxmpc.process.plant import JaxPlant, Outputs, Parameter, Signals, checked_parameters
@@ -89,10 +89,7 @@ class ModelPlant(JaxPlant):
         self.actuators = Actuators.of(actuators, len(self.mv_names))
         names = (*self.cv_names, *self.mv_names)
         for name, value in (start or {}).items():
-            if name not in names:
-                raise InputError(
-                    f"plant.start.{name}", value, f"one of {', '.join(names)}", near(name, names)
-                )
+            among(f"plant.start.{name}", name, names, "one of", value)
             if not is_number(value):
                 unit = _units(model).get(name) or ("CV unit" if name in self.cv_names else "MV unit")
                 raise InputError(f"plant.start.{name}", value, f"a finite number [{unit}]")

@@ -12,7 +12,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from jaxmpc.errors import InputError, near
+from jaxmpc.check import among
+from jaxmpc.errors import InputError
 from jaxmpc.files import toml_value
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.file import VARIABLE
@@ -198,9 +199,7 @@ def _check(model: StepResponseModel, steps: Mapping[str, float], switches: Seque
                 raise InputError(f"model.{kind}", name, expected, "Rename it in the model file")
     for option, names in (("--step", steps), ("--on-off", switches)):
         for mv in names:
-            if mv not in model.mv_names:
-                known = f"an MV of the model: {', '.join(model.mv_names)}"
-                raise InputError(option, mv, known, near(mv, model.mv_names))
+            among(option, mv, model.mv_names, "an MV of the model:")
     for mv, step in steps.items():
         if not 0 < step < math.inf:
             raise InputError("--step", f"{mv}={step:g}", "a positive step [MV unit]")

@@ -9,17 +9,22 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from jaxmpc import html
-from jaxmpc.errors import InputError, near
-from jaxmpc.model.transfer_function import TransferFunction
+from jaxmpc.check import among
+from jaxmpc.errors import InputError
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS, Tuning, make_tuning
 from jaxmpc.process.actuator import Actuator
 from jaxmpc.process.reference import Reference
+from jaxmpc.process.variables import Cv as Cv
+from jaxmpc.process.variables import KeyFigure, ModelSource
+from jaxmpc.process.variables import Mv as Mv
+from jaxmpc.process.variables import PlantSource as PlantSource
+from jaxmpc.process.variables import Variable as Variable
 
 Fields = dict[str, Any]
 BLOCKING = "moves", "inputs", "none"
@@ -28,100 +33,6 @@ BLOCKING = "moves", "inputs", "none"
 def amount(value: float, unit: str) -> str:
     """A number in three digits with its unit, if it has one."""
     return f"{value:.3g}" + (f" {unit}" if unit not in ("", "1") else "")
-
-
-@dataclasses.dataclass(frozen=True)
-class Variable:
-    """A CV, an MV or a disturbance."""
-
-    name: str
-    unit: str
-    label: str  # in words, without the unit
-    span: float = 1.0  # how far it typically moves, in its unit
-    tag: str = ""  # what logs of the plant call it; its name, if not given
-
-    @property
-    def column(self) -> str:
-        """Of a log."""
-        return self.tag or self.name
-
-
-@dataclasses.dataclass(frozen=True)
-class Cv(Variable):
-    """A controlled variable."""
-
-    low: float = -np.inf  # soft limits, for presets that do not give their own [CV unit]
-    high: float = np.inf
-    settled: float = 0.0  # half width around the setpoint in which it counts as settled [CV unit]
-    setpoint_tag: str = ""  # what logs call its setpoint, if they have it
-
-
-@dataclasses.dataclass(frozen=True)
-class Mv(Variable):
-    """A manipulated variable."""
-
-    actuator: Actuator = dataclasses.field(default_factory=Actuator)  # what it does with a demand
-    low: float = -np.inf  # limits, for presets that do not give their own [MV unit]
-    high: float = np.inf
-    move: float = np.inf  # largest move per sample, likewise [MV unit]
-    smallest_move: float = 0.0  # what counts as a move in key figures is larger [MV unit]
-
-
-@dataclasses.dataclass(frozen=True)
-class PlantSource:
-    """Where a plant comes from.
-
-    Attributes:
-        kind: ``model`` (a step-response model as its own plant), ``jax``, ``fmu`` or ``python``.
-        source: a file, or ``module:name`` of a function that gets ``actuators`` and gives the plant.
-        options: further arguments of the plant.
-    """
-
-    kind: Literal["model", "jax", "fmu", "python"]
-    source: str = ""
-    options: Fields = dataclasses.field(default_factory=dict)
-
-
-@dataclasses.dataclass(frozen=True)
-class Response:
-    """The response of a CV to an MV or a measured disturbance [CV unit per its unit, seconds]."""
-
-    cv: str
-    of: str
-    function: TransferFunction
-
-
-@dataclasses.dataclass(frozen=True)
-class ModelSource:
-    """Where the step-response model comes from: a file, transfer functions, or a step test on the plant."""
-
-    file: str = ""
-    responses: tuple[Response, ...] = ()  # transfer functions; pairs that are not listed do not respond
-    # of the step test, by MV [MV unit]; of transfer functions, what CVs and MVs deviate from, 0 where not given
-    working_point: dict[str, float] = dataclasses.field(default_factory=dict)
-    steps: dict[str, float] = dataclasses.field(default_factory=dict)  # sizes of its steps, by MV [MV unit]
-    disturbance_steps: dict[str, float] = dataclasses.field(
-        default_factory=dict
-    )  # of measured disturbances, by name
-    # positions of one or two MVs at which the models of a gain schedule are identified [MV unit]
-    schedule: dict[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
-    samples: int = 250  # coefficients
-
-    @property
-    def given(self) -> bool:
-        """Whether it needs no step test."""
-        return bool(self.file or self.responses)
-
-
-@dataclasses.dataclass(frozen=True)
-class KeyFigure:
-    """An integral over a run that belongs to this process, such as a volume produced."""
-
-    name: str
-    label: str
-    unit: str
-    integral_of: str  # CV or MV, which is held from sample to sample
-    per: float = 1.0  # seconds of the time unit in the unit of the rate
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -249,10 +160,7 @@ class Process:
             InputError: for an unknown preset; unknown fields are refused by `make_tuning`.
         """
         preset = self.default_preset if preset is None else preset
-        if preset not in self.presets:
-            raise InputError(
-                "tuning", preset, f"one of the presets {', '.join(self.presets)}", near(preset, self.presets)
-            )
+        among("tuning", preset, self.presets, "one of the presets")
         own: Fields = {}
         for key, field, variables in (
             ("cv_low", "low", self.cvs),
@@ -292,10 +200,7 @@ class Process:
             InputError: for an unknown name.
         """
         name = self.default_reference if name is None else name
-        if name not in self.references:
-            raise InputError(
-                "reference", name, f"one of {', '.join(self.references)}", near(name, self.references)
-            )
+        among("reference", name, self.references)
         return self.references[name]
 
     def _complete(self, key: str, value: Any) -> Any:

@@ -10,13 +10,12 @@ import msgspec
 from jaxmpc.check import is_number
 from jaxmpc.errors import InputError, near
 from jaxmpc.model.transfer_function import TransferFunction
-from jaxmpc.process.process import Response
 
 LONGEST = 20_000  # samples of a response
 
 
 class TransferFunctionSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One entry, of an MV or of a measured disturbance; see `TransferFunction`."""
+    """One entry: the response of a CV to an MV or a measured disturbance; see `TransferFunction`."""
 
     cv: str
     gain: float  # [CV unit per MV or disturbance unit]
@@ -25,6 +24,16 @@ class TransferFunctionSection(msgspec.Struct, frozen=True, forbid_unknown_fields
     time_constants: tuple[Annotated[float, msgspec.Meta(gt=0)], ...] = ()  # [s]
     dead_time: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # [s]
     lead: float = 0.0  # [s]
+
+    @property
+    def of(self) -> str:
+        """The MV or disturbance."""
+        return self.dv or self.mv
+
+    @property
+    def function(self) -> TransferFunction:
+        """From it to the CV."""
+        return TransferFunction(self.gain, self.time_constants, self.dead_time, self.lead)
 
 
 EXPECTED = {  # numbers that are finite
@@ -36,8 +45,8 @@ EXPECTED = {  # numbers that are finite
 
 def responses_of(
     sections: Sequence[TransferFunctionSection], names: Mapping[str, Sequence[str]]
-) -> tuple[Response, ...]:
-    """The responses of a table of transfer functions.
+) -> tuple[TransferFunctionSection, ...]:
+    """A table of transfer functions, checked.
 
     Args:
         names: of CVs, MVs and disturbances that the model may have: ``cv``, ``mv`` and ``dv``.
@@ -45,7 +54,7 @@ def responses_of(
     Raises:
         InputError: with the path of the entry, for names that are not there, a pair twice, and numbers that cannot be.
     """
-    out: list[Response] = []
+    seen: set[tuple[str, str]] = set()
     for i, section in enumerate(sections):
         path = f"model.transfer_functions[{i}]"
         if bool(section.mv) == bool(section.dv):
@@ -60,9 +69,7 @@ def responses_of(
                 raise InputError(f"{path}.{key}", getattr(section, key), expected)
         if section.lead and not section.time_constants:
             raise InputError(f"{path}.lead", section.lead, "0 where there is no time constant [s]")
-        of = section.dv or section.mv
-        if any((section.cv, of) == (other.cv, other.of) for other in out):
-            raise InputError(path, f"{of} on {section.cv}", "each pair once")
-        function = TransferFunction(section.gain, section.time_constants, section.dead_time, section.lead)
-        out.append(Response(section.cv, of, function))
-    return tuple(out)
+        if (section.cv, section.of) in seen:
+            raise InputError(path, f"{section.of} on {section.cv}", "each pair once")
+        seen.add((section.cv, section.of))
+    return tuple(sections)

@@ -95,40 +95,10 @@ class PiecewiseMilp:
         for bit, (ones, zeros) in zip(at["code"], codes, strict=True):
             self._row(-np.inf, 0.0, np.append(ones, bit), np.append(one(len(ones)), -1.0))
             self._row(-np.inf, 1.0, np.append(zeros, bit), one(len(zeros) + 1))
-        unit = np.maximum(np.abs(points).max(axis=0), 1e-12)
-        scaled = points / unit
-        # the MVs with bands first: HiGHS may end elsewhere among equally good points if rows change places
-        for k, own in sorted(enumerate(ranges), key=lambda row: len(row[1]) == 1):  # (6.19e)
-            if len(own) == 1:
-                self._row(own[0][0] / unit[k], own[0][1] / unit[k], at["share"], scaled[:, k])
-                continue
-            chosen = at[f"range {k}"]
-            self._row(1.0, 1.0, chosen, one(len(own)))
-            for ends, side in zip(np.array(own).T / unit[k], ((0.0, np.inf), (-np.inf, 0.0)), strict=True):
-                self._row(*side, np.append(at["share"], chosen), np.append(scaled[:, k], -ends))
-        for k, step in enumerate(steps):
-            if step is not None:
-                n = at[f"steps {k}"]
-                self.low[n] = np.ceil(np.min(ranges[k]) / step - 1e-9)
-                self.high[n] = np.floor(np.max(ranges[k]) / step + 1e-9)
-                self._row(0.0, 0.0, np.append(at["share"], n), np.append(scaled[:, k], -step / unit[k]))
+        self._limit_mvs()
         self.empty = bool((self.low > self.high).any())
-        wanted = np.isfinite(demand)
-        for c in range(cvs):
-            rate = values[:, c] / span[c]
-            self._row(
-                low[c] / span[c], np.inf, np.append(at["share"], at["below"][c]), np.append(rate, 1.0)
-            )  # (6.19c), (6.19d)
-            self._row(
-                -np.inf, high[c] / span[c], np.append(at["share"], at["above"][c]), np.append(rate, -1.0)
-            )
-            if wanted[c]:
-                index = np.concatenate([at["share"], at["more"][[c]], at["less"][[c]]])
-                goal = demand[c] / span[c]
-                self._row(goal, goal, index, np.append(rate, [-1.0, 1.0]))
-        outside = np.concatenate([at["more"], at["less"]])
-        self.high[outside] = np.where(np.tile(wanted, 2), np.inf, 0.0)
-        self.demanded = bool(wanted.any())
+        self._follow(values / span, low / span, high / span, demand / span)
+        self.demanded = bool(np.isfinite(demand).any())
         paid = weight * span
         self.unit: dict[Goal, float] = dict.fromkeys(GOALS, float(paid.max()))
         self.unit["profit"] = float(np.abs(profit).max()) or 1.0
@@ -138,6 +108,39 @@ class PiecewiseMilp:
         for name in ("more", "less"):
             self.cost["distance"][at[name]] = paid / self.unit["distance"]
         self.cost["profit"][at["share"]] = -profit / self.unit["profit"]
+
+    def _limit_mvs(self) -> None:
+        """Ranges (6.19e) and steps of the MVs."""
+        at, points = self.at, self.points
+        unit = np.maximum(np.abs(points).max(axis=0), 1e-12)
+        scaled = points / unit
+        # the MVs with bands first: HiGHS may end elsewhere among equally good points if rows change places
+        for k, own in sorted(enumerate(self.ranges), key=lambda row: len(row[1]) == 1):  # (6.19e)
+            if len(own) == 1:
+                self._row(own[0][0] / unit[k], own[0][1] / unit[k], at["share"], scaled[:, k])
+                continue
+            chosen = at[f"range {k}"]
+            self._row(1.0, 1.0, chosen, np.ones(len(own)))
+            for ends, side in zip(np.array(own).T / unit[k], ((0.0, np.inf), (-np.inf, 0.0)), strict=True):
+                self._row(*side, np.append(at["share"], chosen), np.append(scaled[:, k], -ends))
+        for k, step in enumerate(self.steps):
+            if step is not None:
+                n = at[f"steps {k}"]
+                self.low[n] = np.ceil(np.min(self.ranges[k]) / step - 1e-9)
+                self.high[n] = np.floor(np.max(self.ranges[k]) / step + 1e-9)
+                self._row(0.0, 0.0, np.append(at["share"], n), np.append(scaled[:, k], -step / unit[k]))
+
+    def _follow(self, rate: np.ndarray, low: np.ndarray, high: np.ndarray, demand: np.ndarray) -> None:
+        """Limits (6.19c), (6.19d) and demands of the CVs, in spans, and what leaves them."""
+        at, wanted = self.at, np.isfinite(demand)
+        for c, own in enumerate(rate.T):
+            self._row(low[c], np.inf, np.append(at["share"], at["below"][c]), np.append(own, 1.0))
+            self._row(-np.inf, high[c], np.append(at["share"], at["above"][c]), np.append(own, -1.0))
+            if wanted[c]:
+                index = np.concatenate([at["share"], at["more"][[c]], at["less"][[c]]])
+                self._row(demand[c], demand[c], index, np.append(own, [-1.0, 1.0]))
+        outside = np.concatenate([at["more"], at["less"]])
+        self.high[outside] = np.where(np.tile(wanted, 2), np.inf, 0.0)
 
     def solve(self) -> Best | None:
         """The best point, None if the MV limits leave nothing of the map.

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxmpc.check import is_number
+from jaxmpc.check import among, is_number
 from jaxmpc.errors import InputError
 from jaxmpc.steady.map import SteadyMap, barycentric
 from jaxmpc.steady.milp import PiecewiseMilp
@@ -103,23 +103,13 @@ def optimise(
     """
     names, mv_names = map.cv_names, map.mv_names
     price = _named("prices", prices, (*names, *mv_names), "price per unit")
-    low = _limits("cv_low", cv_low, map, -np.inf)
-    high = _limits("cv_high", cv_high, map, np.inf)
-    for name, unit, least, most in zip(names, map.cv_units, low, high, strict=True):
-        if least > most:
-            raise InputError(
-                f"cv_low.{name}", float(least), f"at most cv_high.{name} = {float(most)!r} [{unit}]"
-            )
+    low, high = _limits(map, cv_low, cv_high)
     ranges, steps = _ranges(mv_ranges, map), _steps(mv_steps, map)
     demanded = _named("target", target, names, "CV unit")
     demand = np.array([demanded.get(name, np.nan) for name in names])
     span = np.ptp(map.values[np.unique(map.triangles)], axis=0)
     span = np.where(span > 0, span, 1.0)
-    weighed = _named("weights", weights, names, "1/CV unit")
-    weight = np.array([weighed.get(name, 1.0 / s) for name, s in zip(names, span, strict=True)])
-    if (weight < 0).any() or not (weight > 0).any():
-        raise InputError("weights", weights, "0 or more [1/CV unit], not all of them 0")
-
+    weight = _weight(weights, names, span)
     value = np.array([price.get(name, 0.0) for name in names])
     cost = np.array([price.get(name, 0.0) for name in mv_names])
     milp = PiecewiseMilp(
@@ -193,15 +183,33 @@ def _named(path: str, given, names: tuple[str, ...], unit: str) -> dict[str, flo
     if not isinstance(given, Mapping):
         raise InputError(path, given, f"a mapping from name to number [{unit}]")
     for name, value in given.items():
-        if name not in names:
-            raise InputError(f"{path}.{name}", value, f"one of the names {', '.join(names)}")
+        among(f"{path}.{name}", name, names, "one of the names", value)
         if not is_number(value):
             raise InputError(f"{path}.{name}", value, f"a finite number [{unit}]")
     return {name: float(value) for name, value in given.items()}
 
 
-def _limits(path: str, given, map: SteadyMap, infinite: float) -> np.ndarray:
-    """Limits in CV order, infinite where there are none."""
+def _weight(given, names: tuple[str, ...], span: np.ndarray) -> np.ndarray:
+    """In CV order, 1 over the span where not named."""
+    named = _named("weights", given, names, "1/CV unit")
+    weight = np.array([named.get(name, 1.0 / s) for name, s in zip(names, span, strict=True)])
+    if (weight < 0).any() or not (weight > 0).any():
+        raise InputError("weights", given, "0 or more [1/CV unit], not all of them 0")
+    return weight
+
+
+def _limits(map: SteadyMap, cv_low, cv_high) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper limits in CV order, infinite where there are none."""
+    low, high = _limit("cv_low", cv_low, map, -np.inf), _limit("cv_high", cv_high, map, np.inf)
+    for name, unit, least, most in zip(map.cv_names, map.cv_units, low, high, strict=True):
+        if least > most:
+            expected = f"at most cv_high.{name} = {float(most)!r} [{unit}]"
+            raise InputError(f"cv_low.{name}", float(least), expected)
+    return low, high
+
+
+def _limit(path: str, given, map: SteadyMap, infinite: float) -> np.ndarray:
+    """Limits on one side."""
     names = map.cv_names
     if given is None:
         given = {}
@@ -263,8 +271,7 @@ def _by_mv(path: str, given, map: SteadyMap, expected: str) -> Mapping[str, Any]
     if not isinstance(given, Mapping):
         raise InputError(path, given, expected)
     for name, value in given.items():
-        if name not in map.mv_names:
-            raise InputError(f"{path}.{name}", value, f"one of the names {', '.join(map.mv_names)}")
+        among(f"{path}.{name}", name, map.mv_names, "one of the names", value)
     return given
 
 

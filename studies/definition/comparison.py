@@ -12,7 +12,7 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from jaxmpc.check import located, require
+from jaxmpc.check import among, located, require
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
 from jaxmpc.process.process import Process
@@ -188,7 +188,7 @@ class ComparisonDefinition(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
         Raises:
             InputError: naming the field.
         """
-        require(self.plant in process.plants, "plant", self.plant, f"one of {', '.join(process.plants)}")
+        among("plant", self.plant, process.plants)
         names = [controller.name for controller in self.controllers]
         distinct = names and len(set(names)) == len(names)
         require(distinct, "controllers", names, "one or more controllers with distinct names")

@@ -18,6 +18,7 @@ from jaxmpc.errors import InputError, near
 from jaxmpc.problem.declared import declared
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS as TUNING
+from jaxmpc.problem.tuning import Tuning
 from jaxmpc.problem.values import checked_values
 from jaxmpc.process.plant import Parameter
 from jaxmpc.process.process import BLOCKING, Process
@@ -121,6 +122,16 @@ class Field:
         except ValueError:
             raise InputError(path, text, f"{self.expected} for {self.key}") from None
         return self.check(path, value)
+
+    def held(self, process: Process, tuning: Tuning) -> Any:
+        """What holds where nothing is given: a number of the tuning as that has it, else the default."""
+        section, _, rest = self.key.partition(".")
+        if section != "tuning" or self.kind != "number":
+            return self.default
+        name, _, channel = rest.partition(".")
+        values = np.asarray(getattr(tuning, name))
+        names = {"cv": process.cv_names, "mv": process.mv_names}.get(TUNING[name].of)
+        return float(values[names.index(channel)] if names else values)
 
     def column(self, values: list[Any]) -> np.ndarray:
         """Values as a scenario coordinate: floats, or texts as an object array."""

@@ -328,9 +328,8 @@ class Study:
 
 def code_hash() -> str:
     """Of the code that turns the numbers of a scenario into results."""
-    packages = [fingerprint.source_hash(package) for package in ("jaxmpc", "identify")]
     modules = [fingerprint.module_hash(f"studies.{name}") for name in COMPUTING]
-    return fingerprint.content_hash(packages, modules)
+    return fingerprint.content_hash(list(fingerprint.packages_hash().values()), modules)
 
 
 def expand_sweep(definition: StudyDefinition, *, confirmed: bool = False) -> Study:

@@ -18,10 +18,10 @@ from msgspec import UNSET
 from msgspec.structs import replace
 
 from identify.plants import parameters_of
-from jaxmpc.check import require
+from jaxmpc.check import among, require
 from jaxmpc.controller.measurement import FAULTS
 from jaxmpc.decoding import decode
-from jaxmpc.errors import InputError, near
+from jaxmpc.errors import InputError
 from jaxmpc.files import read_named_toml
 from jaxmpc.process.file import load_process, shipped_processes
 from jaxmpc.process.process import Process
@@ -121,9 +121,7 @@ class StudyDefinition:
         axes, places = list(self.axes), list(self.places)
         for key, body in quick.axes.items():
             place = f'quick.axes."{key}"'
-            if key not in known:
-                expected = f"the (first) key of an axis: {', '.join(known)}"
-                raise InputError(place, body, expected, near(key, known))
+            among(place, key, known, "the (first) key of an axis:", body)
             i, change = known.index(key), _convert(body, Cut, place)
             given = {
                 name: value for name, value in msgspec.structs.asdict(change).items() if value is not UNSET
@@ -227,9 +225,8 @@ def process_fields(study: StudySection, folder: str | Path) -> tuple[Process, di
         if error.field == "process":
             raise InputError("study.process", error.value, error.expected, error.hint) from None
         raise
-    if study.plant and study.plant not in process.plants:
-        known = ", ".join(process.plants)
-        raise InputError("study.plant", study.plant, f"one of {known}", near(study.plant, process.plants))
+    if study.plant:
+        among("study.plant", study.plant, process.plants)
     return process, study_fields(process, parameters_of(process, study.plant))
 
 
@@ -280,12 +277,7 @@ def _events(
         if table == "event":
             continue
         if table == "sensor_fault":
-            require(
-                event.cv in process.cv_names,
-                f"{where}[{i}].cv",
-                event.cv,
-                f"one of {', '.join(process.cv_names)}",
-            )
+            among(f"{where}[{i}].cv", event.cv, process.cv_names)
             continue
         names = process.disturbance_names
         require(names, where, value, f"nothing: {process.name} has no disturbances")

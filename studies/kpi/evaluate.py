@@ -133,6 +133,11 @@ def windows_of(data: xr.Dataset) -> list[np.ndarray]:
     return [np.flatnonzero(window == w) for w in range(int(window.max()) + 1)]
 
 
+def quarters(data: xr.Dataset) -> list[np.ndarray]:
+    """Positions of the samples of the last quarter of each setpoint window."""
+    return [samples[3 * len(samples) // 4 :] for samples in windows_of(data)]
+
+
 def window_deviation(data: xr.Dataset, controller: str) -> np.ndarray:
     """Mean absolute deviation of a finished run from the setpoint in every window, ``"window cv"`` [CV unit]."""
     run = data.sel(controller=controller)
@@ -148,4 +153,4 @@ def final_deviation(data: xr.Dataset, controller: str) -> np.ndarray:
     """
     run = data.sel(controller=controller)
     scaled = (run.measurement.values - run.setpoint.values) / run.tuning_deadzone.values
-    return np.array([scaled[samples[3 * len(samples) // 4 :]].mean(axis=0) for samples in windows_of(data)])
+    return np.array([scaled[samples].mean(axis=0) for samples in quarters(data)])

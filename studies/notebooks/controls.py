@@ -14,7 +14,6 @@ from figures.explore import COLOURS, Shown
 from jaxmpc.check import require
 from jaxmpc.errors import InputError
 from jaxmpc.files import toml_value
-from jaxmpc.problem.tuning import FIELDS as TUNING
 from studies.notebooks.export import cell_text
 from studies.notebooks.loop import LISTS, SHORT, Explorer, ExploreRun, nested, tuning_of
 
@@ -124,20 +123,10 @@ def further_fields(explored: Explorer) -> list[dict[str, str]]:
 
 def chosen_fields(explored: Explorer, preset: str, keys: Sequence[str]) -> list[tuple[str, str, str]]:
     """Some keys with a label and the text of what holds without them."""
-    tuning, names = (
-        tuning_of(explored, preset),
-        {"cv": explored.process.cv_names, "mv": explored.process.mv_names},
-    )
-    out = []
-    for key in keys:
-        field, (section, _, rest) = explored.fields[key], key.partition(".")
-        name, _, channel = rest.partition(".")
-        value = field.default
-        if section == "tuning" and field.kind == "number":
-            values, of = np.asarray(getattr(tuning, name)), TUNING[name].of
-            value = float(values[names[of].index(channel)] if of else values)
-        out.append((key, f"{field.label} [{field.unit or field.kind}]", cell_text(value)))
-    return out
+    tuning, found = tuning_of(explored, preset), [explored.fields[key] for key in keys]
+    words = (f"{field.label} [{field.unit or field.kind}]" for field in found)
+    values = (cell_text(field.held(explored.process, tuning)) for field in found)
+    return list(zip(keys, words, values, strict=True))
 
 
 def example_lists(explored: Explorer) -> str:

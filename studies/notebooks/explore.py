@@ -2,7 +2,7 @@
 
 ``jaxmpc explore`` serves it. As a script, ``python -m studies.notebooks.explore``, it runs once and prints key figures.
 Computing is in `studies.notebooks.loop`, the controls of a process in `controls`, drawing in `figures.explore` and
-`figures.choose`; here is only where things go.
+`figures.choose`, what is made of them in `views`; here is only where things go.
 """
 
 import marimo
@@ -27,19 +27,13 @@ def _(mo):
 
     import altair  # noqa: F401  (while the first run is made, and not after it)
 
-    from figures import choose, closed_loop
+    from figures import choose
     from figures import explore as draw
-    from jaxmpc import html
     from jaxmpc.errors import InputError
-    from studies.notebooks import controls, export
+    from studies.notebooks import controls, export, views
     from studies.notebooks import loop as explore
 
-    def vega(spec):
-        """A chart on the page, whose selections can be read."""
-        return mo.ui.altair_chart(draw.altair_of(spec), chart_selection=False, legend_selection=False)
-
-    SLIDER = {"show_value": True, "debounce": True, "full_width": True}
-    return InputError, SLIDER, choose, closed_loop, controls, draw, explore, export, html, meta, vega
+    return InputError, choose, controls, draw, explore, export, meta, views
 
 
 @app.cell
@@ -51,61 +45,9 @@ def _(mo):
 
 
 @app.cell
-def _(mo):
-    import contextlib
-    import queue
-    import time
-
-    from jaxmpc.programs.clock import Clock
-    from jaxmpc.programs.compilation import told
-
-    @contextlib.contextmanager
-    def compilation_shown(said=()):
-        """Shows in its cell that something is compiled meanwhile; no threads but marimo's own reach the page."""
-        lines = queue.SimpleQueue()
-        for line in said:
-            lines.put(line)
-
-        def show():
-            for line in iter(lines.get, None):
-                mo.output.append(mo.md(line))
-
-        thread = mo.Thread(target=show)
-        thread.start()
-        try:
-            with told(lines.put):
-                yield
-        finally:
-            lines.put(None)
-            thread.join()
-            mo.output.clear()
-
-    @contextlib.contextmanager
-    def progress_shown():
-        """Gives what takes done and total samples; a bar is there as soon as a run takes longer than a second."""
-        clock, bars, past = Clock(), contextlib.ExitStack(), [0.0]
-
-        def report(done, total):
-            part = done / total
-            if not past[0] and (clock.seconds < 1 or part == 1):
-                return
-            if not past[0]:
-                bar = mo.status.progress_bar(total=1, title="running", show_eta=True, remove_on_exit=True)
-                report.bar = bars.enter_context(bar)
-                report.bar.start_time = time.time() - clock.seconds
-            report.bar.update(increment=part - past[0])
-            past[0] = part
-
-        with bars:
-            yield report
-
-    return compilation_shown, progress_shown
-
-
-@app.cell
-def _(InputError, compilation_shown, explore, meta, mo):
+def _(InputError, explore, meta, mo, views):
     try:
-        with compilation_shown(meta["first"].said if "first" in meta else ()):
+        with views.compilation_shown(meta["first"].said if "first" in meta else ()):
             explored = meta["first"].explorer() if "first" in meta else explore.explorer()
     except InputError as error:
         mo.stop(True, mo.callout(str(error), kind="warn"))
@@ -113,7 +55,7 @@ def _(InputError, compilation_shown, explore, meta, mo):
 
 
 @app.cell
-def _(controls, explored, html, mo):
+def _(controls, explored, mo, views):
     # Shown by the cell that makes them, as all controls are: a cell that only lays them out would run, and draw every
     # one of them again, whenever one is moved.
     choices = mo.ui.dictionary(
@@ -123,41 +65,20 @@ def _(controls, explored, html, mo):
         }
     )
     soft = mo.ui.switch(value=True, label="Soft MPC")
-    _rows = "".join(f"<span>{name}</span>{element}" for name, element in choices.elements.items())
-    choices_panel = mo.vstack(
-        [
-            mo.Html(f"<b>{html.escape(explored.process.title or explored.process.name)}</b>"),
-            mo.Html(
-                '<div style="display:grid;grid-template-columns:auto 1fr;gap:0 1rem;align-items:center;'
-                f'font-size:0.9rem">{_rows}</div>'
-            ),
-            soft,
-        ],
-        gap=0.4,
-    )
+    choices_panel = views.chosen_of(explored.process.title or explored.process.name, choices, soft)
     return choices, choices_panel, soft
 
 
 @app.cell
-def _(SLIDER, choices, controls, explored, mo):
-    tuning = mo.ui.dictionary(
-        {
-            key: mo.ui.slider(steps=slider.steps, value=slider.value, label=slider.label, **SLIDER)
-            for key, slider in controls.tuning_sliders(explored, choices.value["preset"]).items()
-        }
-    )
+def _(choices, controls, explored, mo, views):
+    tuning = views.sliders(controls.tuning_sliders(explored, choices.value["preset"]))
     tuning_panel = mo.vstack(list(tuning.elements.values()), gap=0.4)
     return tuning, tuning_panel
 
 
 @app.cell
-def _(SLIDER, controls, explore, explored, mo):
-    scenario = mo.ui.dictionary(
-        {
-            key: mo.ui.slider(steps=slider.steps, value=slider.value, label=slider.label, **SLIDER)
-            for key, slider in controls.scenario_sliders(explored).items()
-        }
-    )
+def _(controls, explore, explored, mo, views):
+    scenario = views.sliders(controls.scenario_sliders(explored))
     _of = lambda *heads: [e for key, e in scenario.elements.items() if key.startswith(heads)]  # noqa: E731
     _from = f"<span><b>Setpoints</b> from {explore.STEP * explored.process.dt:g} s</span>"
     setpoint_panel = mo.vstack([mo.Html(_from), *_of("setpoint.")], gap=0.4)
@@ -167,18 +88,13 @@ def _(SLIDER, controls, explore, explored, mo):
 
 
 @app.cell
-def _(controls, explored, mo):
-    _rows = controls.further_fields(explored)
-    fields = mo.ui.table(
-        _rows,
-        selection="multi",
+def _(controls, explored, views):
+    fields = views.table(
+        controls.further_fields(explored),
+        "Every other setting: search, tick, and set it below",
         pagination=True,
-        page_size=8,
         show_download=False,
-        show_column_summaries=False,
-        show_data_types=False,
         wrapped_columns=["setting"],
-        label="Every other setting: search, tick, and set it below",
     )
     return (fields,)
 
@@ -229,17 +145,16 @@ def _(choices, mo, model_panel, page, setpoint_panel, tuning_panel, choices_pane
 def _(
     InputError,
     choices,
-    compilation_shown,
     controls,
     events,
     explore,
     explored,
     further,
     mo,
-    progress_shown,
     scenario,
     soft,
     tuning,
+    views,
 ):
     run, refused = None, None
     try:
@@ -252,7 +167,7 @@ def _(
             further.value,
             events.value,
         )
-        with compilation_shown(), progress_shown() as _report:
+        with views.compilation_shown(), views.progress_shown() as _report:
             run = explore.run(explored, _base, _report)
     except InputError as error:
         refused = mo.callout(str(error), kind="warn")
@@ -260,10 +175,15 @@ def _(
 
 
 @app.cell
-def _(SLIDER, explored, mo, run):
+def _(explored, mo, run, views):
     _dt, _samples = explored.process.dt, 180 if run is None else run.trajectory.samples
     plan_time = mo.ui.slider(
-        0, (_samples - 1) * _dt, _dt, value=min(30, _samples - 1) * _dt, label="plan made at [s]", **SLIDER
+        0,
+        (_samples - 1) * _dt,
+        _dt,
+        value=min(30, _samples - 1) * _dt,
+        label="plan made at [s]",
+        **views.SLIDER,
     )
     return (plan_time,)
 
@@ -289,11 +209,11 @@ def _(controls, get_pins, mo, run, set_pins):
 
 
 @app.cell
-def _(controls, draw, get_pins, kept, page, run, vega):
+def _(controls, draw, get_pins, kept, page, run, views):
     chart = None
     if run is not None and page.value == "Run a loop":
         _spec = draw.tracking(controls.shown(run, get_pins()), zoom=kept["zoom"])
-        chart = vega(_spec)
+        chart = views.vega(_spec)
     return (chart,)
 
 
@@ -305,39 +225,23 @@ def _(chart, kept):
 
 
 @app.cell
-def _(chart, draw, export, controls, get_pins, mo, page, pin, pin_name, refused, run, unpin):
+def _(chart, controls, get_pins, mo, page, pin, pin_name, refused, run, unpin, views):
     def _view():
         if run is None:
             return refused
-        runs, colours = controls.named(run, get_pins())
-        side = [
-            mo.Html(
-                '<div id="key-figures" style="font-size:12px;line-height:1.3;white-space:nowrap">'
-                f"{export.figures_table(runs, colours)}</div>"
-            ),
-            mo.Html(
-                '<div style="display:flex;gap:0.5rem;align-items:center;white-space:nowrap">'
-                f'{pin}<span style="width:7rem">{pin_name}</span></div>'
-            ),
-            mo.hstack(list(unpin.elements), justify="start", wrap=True),
-            mo.md(f"<small>run and key figures: {run.seconds:.2f} s</small>"),
-        ]
-        drawn = mo.vstack([chart, mo.md(f"<small>{draw.CAPTION}</small>")], gap=0.1)
-        if len(runs) > 2:  # a wide table
-            return mo.vstack([drawn, *side], gap=0.3)
-        return mo.hstack([drawn, mo.vstack(side, gap=0.3)], widths=[2.15, 1], align="start", gap=0.75)
+        pinning = [mo.Html(views.ROW.format(f'{pin}<span style="width:7rem">{pin_name}</span>'))]
+        pinning.append(mo.hstack(list(unpin.elements), justify="start", wrap=True))
+        return views.of_run(chart, *controls.named(run, get_pins()), pinning, run.seconds)
 
     _view() if page.value == "Run a loop" else None
     return
 
 
 @app.cell
-def _(controls, draw, export, get_pins, mo, page, run):
+def _(controls, export, get_pins, mo, page, run):
     def _view():
-        runs, colours = controls.named(run, get_pins())
-        return mo.Html(
-            f'<div id="differences" style="font-size:12px">{export.differences_table(runs, colours)}</div>'
-        )
+        table = export.differences_table(*controls.named(run, get_pins()))
+        return mo.Html(f'<div id="differences" style="font-size:12px">{table}</div>')
 
     _view() if page.value == "Run a loop" and run is not None and get_pins() else None
     return
@@ -354,36 +258,18 @@ def _(events_panel, further_panel, mo, page):
 
 
 @app.cell
-def _(draw, mo, page, plan_time, run, vega):
+def _(draw, mo, page, plan_time, run, views):
     def _view():
-        return mo.vstack([plan_time, vega(draw.planned(run.data, float(plan_time.value)))], gap=0.3)
+        return mo.vstack([plan_time, views.vega(draw.planned(run.data, float(plan_time.value)))], gap=0.3)
 
     _view() if page.value == "Run a loop" and run is not None else None
     return
 
 
 @app.cell
-def _(controls, draw, export, get_pins, mo, page, run):
-    def _view():
-        runs, colours = controls.named(run, get_pins())
-        toml, python = export.as_toml(run), export.as_python(run)
-        downloads = [
-            mo.download(toml.encode(), "explored.toml", "application/toml", label="TOML"),
-            mo.download(python.encode(), "tuning.py", "text/x-python", label="Python"),
-            mo.download(
-                lambda: export.as_page(runs, colours).encode(),
-                "runs.html",
-                "text/html",
-                label="Page of these runs",
-                disabled=not draw.can_be_sent(),
-            ),
-        ]
-        shown = mo.accordion(
-            {"As a study file": mo.md(f"```toml\n{toml}```"), "As Python": mo.md(f"```python\n{python}```")}
-        )
-        return mo.vstack([mo.hstack(downloads, justify="start"), shown], gap=0.3)
-
-    _view() if page.value == "Run a loop" and run is not None else None
+def _(controls, get_pins, page, run, views):
+    _shown = page.value == "Run a loop" and run is not None
+    views.of_exports(run, *controls.named(run, get_pins())) if _shown else None
     return
 
 
@@ -408,10 +294,10 @@ def _(InputError, choose, mo, path):
 
 
 @app.cell
-def _(choose, get_ranges, runs, vega):
+def _(choose, get_ranges, runs, views):
     across = None
     if runs is not None and runs.axes:
-        across = vega(choose.parallel(runs, choose.within(runs, get_ranges())))
+        across = views.vega(choose.parallel(runs, choose.within(runs, get_ranges())))
     return (across,)
 
 
@@ -453,26 +339,19 @@ def _(across, mo, page, path, ranges_panel, scatter, trouble):
 
 
 @app.cell
-def _(choose, mo, page, runs, vega):
+def _(choose, mo, page, runs, views):
     _shown = page.value == "Open a study" and runs is not None and len(runs.axes) > 0
-    vega(choose.importance_chart(runs)) if _shown else None
+    views.vega(choose.importance_chart(runs)) if _shown else None
     return
 
 
 @app.cell
-def _(choose, chosen, mo, runs):
+def _(choose, chosen, runs, views):
     rows = None
     if runs is not None:
         _columns = ["number", choose.X, choose.Y, "best", *(runs.axes or ["run"])]
         _few = runs.table[chosen].sort_values(choose.X)[_columns].rename(columns=runs.titles).round(4)
-        rows = mo.ui.table(
-            _few.to_dict("records"),
-            selection="multi",
-            page_size=8,
-            show_column_summaries=False,
-            show_data_types=False,
-            label="Tick runs to see them beside each other",
-        )
+        rows = views.table(_few.to_dict("records"), "Tick runs to see them beside each other")
     return (rows,)
 
 
@@ -498,43 +377,14 @@ def _(choose, mo, path, rows, runs, scatter):
 
 
 @app.cell
-def _(
-    InputError, again, choose, closed_loop, compilation_shown, draw, html, mo, page, path, picked, runs, vega
-):
+def _(InputError, again, mo, page, path, picked, runs, views):
     def _view():
         if not picked:
             return mo.md("Pick a point, or tick runs in the table, to see them.")
-        store, shown = path.value.strip(), picked[: len(draw.COLOURS)]
         try:
-            if again.value:
-                from pathlib import Path
-
-                from studies.rerun import rerun
-
-                with compilation_shown(), mo.status.spinner("running"):
-                    found = rerun(Path(store), picked[0])
-                data = [
-                    closed_loop.of_trajectory(
-                        found.trajectory, found.deadzone, found.kind, found.actuator, found.process
-                    )
-                ]
-            else:
-                data = [choose.stored(store, number) for number in shown]
+            return views.of_picked(path.value.strip(), picked, runs, again)
         except InputError as error:
             return mo.callout(str(error), kind="warn")
-        names = runs.table.set_index("number")["run"]
-        lines = [
-            draw.Shown(str(number), colour, one)
-            for number, colour, one in zip(shown, draw.COLOURS, data, strict=False)
-        ]
-        heads = [(line.colour, line.name, names[int(line.name)]) for line in lines]
-        title = mo.Html(
-            "<br>".join(
-                f'<b style="color:{colour}">{name}</b> {html.escape(run)}' for colour, name, run in heads
-            )
-        )
-        drawn = vega(draw.tracking(lines, width=800))
-        return mo.vstack([mo.hstack([title, again], widths=[5, 1]), drawn], gap=0.3)
 
     _view() if page.value == "Open a study" else None
     return

@@ -15,7 +15,7 @@ from figures import style
 from jaxmpc import html
 from jaxmpc.files import toml_keys
 from jaxmpc.problem.structure import Structure
-from jaxmpc.problem.tuning import FIELDS as TUNING
+from jaxmpc.problem.tuning import by_name
 from studies.definition.fields import as_text
 from studies.definition.sections import Section
 from studies.notebooks.loop import ExploreRun, in_force, shown_figures, written
@@ -36,14 +36,10 @@ def as_python(done: ExploreRun) -> str:
     """
     structure, tuning = done.scenario.structure, done.scenario.tuning
     given = {field.name: getattr(structure, field.name) for field in dataclasses.fields(Structure)}
-    values = {}
-    for key, field in TUNING.items():
-        value = np.asarray(getattr(tuning, key)).tolist()
-        names = {"cv": structure.cv_names, "mv": structure.mv_names, "": ()}[field.of]
-        values[key] = dict(zip(names, value, strict=True)) if names else value
     lines = ["from math import inf", "", "from jaxmpc import Structure, make_tuning", ""]
     lines += ["structure = Structure(", *(f"    {name}={value!r}," for name, value in given.items()), ")"]
-    lines += ["tuning = make_tuning(", "    structure,", *(f"    {k}={v!r}," for k, v in values.items()), ")"]
+    values = (f"    {key}={value!r}," for key, value in by_name(structure, tuning).items())
+    lines += ["tuning = make_tuning(", "    structure,", *values, ")"]
     return "\n".join([*lines, *_happening(done)]) + "\n"
 
 

@@ -23,7 +23,6 @@ from figures.closed_loop import RUN, of_trajectory
 from jaxmpc.errors import InputError
 from jaxmpc.loop.trajectory import RECORDABLE, Trajectory, TrajectoryBatch
 from jaxmpc.model.step_response import StepResponseModel
-from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.problem.tuning import Tuning
 from jaxmpc.process.file import shipped_processes
 from jaxmpc.process.process import Process
@@ -252,22 +251,14 @@ def written(value: float, unit: str) -> tuple[str, str]:
 
 def in_force(done: ExploreRun) -> dict[str, Any]:
     """What every key was set to in a run: what was given, else what the preset, the structure or the default says."""
-    base, tuning, structure = done.definition.base, done.scenario.tuning, done.scenario.structure
-    names = {"cv": structure.cv_names, "mv": structure.mv_names}
+    base, scenario = done.definition.base, done.scenario
     out: dict[str, Any] = {}
     for key, field in done.definition.fields.items():
-        section, _, rest = key.partition(".")
-        name, _, channel = rest.partition(".")
-        if section == "tuning" and field.kind == "number":
-            of = TUNING[name].of
-            values = np.asarray(getattr(tuning, name))
-            out[key] = float(values[names[of].index(channel)] if of else values)
-        elif key in base:
+        out[key] = field.held(done.definition.process, scenario.tuning)
+        if key in ("prediction_horizon", "control_horizon", "first_penalised", "blocks"):
+            out[key] = getattr(scenario.structure, key)
+        if key in base and not (key.startswith("tuning.") and field.numeric):  # which the tuning itself has
             out[key] = base[key]
-        elif key in ("prediction_horizon", "control_horizon", "first_penalised", "blocks"):
-            out[key] = getattr(structure, key)
-        else:
-            out[key] = field.default
     for key in LISTS:
         out[key] = base.get(key, ())
     return out

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from identify.plants import closing, disturbance_of, open_plant
-from jaxmpc.controller.controller import Controllers
+from jaxmpc.controller.batch import Controllers
 from jaxmpc.files import strict_json
 from jaxmpc.loop.simulate import simulate_batches
 from jaxmpc.loop.trajectory import TrajectoryBatch
@@ -59,56 +59,40 @@ def prepare_study(study: Study, progress: Callable[[int, int], None] | None = No
 
 def run_chunk(prepared: PreparedStudy, index: int) -> ChunkResult:
     """Run the closed loops of a chunk."""
-    study = prepared.study
-    chunk = study.chunks[index]
-    group, lanes = study.groups[chunk.group], study.lanes(chunk.group)
+    study, chunk = prepared.study, prepared.study.chunks[index]
     fields, facts = run_scenarios(
+        study,
         [study.scenario(int(k)) for k in chunk.scenarios],
         prepared.models,
-        lanes=lanes,
-        shared_model=len(group.points) == 1,
-        process=study.process,
-        plant=study.definition.study.plant,
+        lanes=study.lanes(chunk.group),
+        shared_model=len(study.groups[chunk.group].points) == 1,
         varying=study.varying_plant(chunk.group),
-        points=len(stored_times(study)),
-        every=study.definition.store.every,
-        trajectories=study.definition.store.trajectories,
     )
     return ChunkResult(index, fields, facts)
 
 
 def run_scenarios(
+    study: Study,
     scenarios: Sequence[Scenario],
     models: Mapping[Point, StepResponseModel],
     *,
     lanes: int,
-    points: int,
-    every: int,
-    trajectories: Sequence[str],
-    process: Process,
-    plant: str = "",
     shared_model: bool = False,
     varying: Sequence[str] = (),
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Run scenarios of one group side by side.
+    """Run scenarios of one group of a study side by side: their stored variables, and facts of the run.
 
     Args:
         scenarios: 1 to `lanes` of them.
         lanes: of the compiled program; it is filled up with copies of the last scenario.
-        points: length of the stored time axis; shorter runs end in NaN (-1 for codes).
-        every: samples from one stored point to the next.
-        trajectories: fields of `Trajectory` to keep.
-        plant: which one of the process; the first if not given.
         varying: parameters of the plant that may differ from lane to lane.
     """
-    clock = Clock()
+    clock, process, kept = Clock(), study.process, study.definition.store
     filled = [*scenarios, *([scenarios[-1]] * (lanes - len(scenarios)))]
     first = filled[0]
     tunings = [s.tuning for s in filled]
     model = [models[first.model_point]] if shared_model else [models[s.model_point] for s in filled]
     controllers = Controllers(first.structure, tunings, model, count=lanes)
-    references = [s.reference for s in filled]
-    seeds: Any = np.array([s.seed for s in filled])
     cvs = len(process.cvs)
 
     def stacked(name: str, *shape: int) -> np.ndarray | None:
@@ -116,25 +100,24 @@ def run_scenarios(
         none = all(value is None for value in given)
         return None if none else np.stack([np.zeros(shape) if value is None else value for value in given])
 
-    plants = _plants(process, plant, filled, varying)
+    plants = _plants(process, study.definition.study.plant, filled, varying)
     shared = plants.shared if isinstance(plants, Lanes) else plants[0] if isinstance(plants, list) else plants
     offsets = stacked("disturbance", first.samples, len(process.disturbances))
-    batches = simulate_batches(
+    (batch,) = simulate_batches(
         controllers,
         plants,
-        references,
+        [s.reference for s in filled],
         samples=first.samples,
         disturbance=None if offsets is None else disturbance_of(process, shared, offsets),
         noise=stacked("noise", cvs),
-        seed=seeds,
+        seed=np.array([s.seed for s in filled]),
         faults=stacked("faults", first.samples, cvs),
         position_feedback=np.array([s.position_feedback for s in filled]),
         preview=first.preview,
         events=first.events,
-        record=tuple(dict.fromkeys((*RECORD, *(f for f in trajectories if f != "setpoint")))),
+        record=tuple(dict.fromkeys((*RECORD, *(f for f in kept.trajectories if f != "setpoint")))),
         lanes_at_once=lanes,
     )
-    (batch,) = batches
     simulated = clock.seconds
     windows = np.stack([s.windows.window(s.structure.dt, s.samples) for s in filled])
     figures = batch_kpis(
@@ -142,8 +125,9 @@ def run_scenarios(
     )
     fields = {name: values[: len(scenarios)] for name, values in figures.items()}
     fields[FLAG] = fields["finite"].astype("i1")
-    for field in trajectories:
-        fields[swept(field).name] = _kept(batch, field, len(scenarios), every, points)
+    points = len(stored_times(study))
+    for field in kept.trajectories:
+        fields[swept(field).name] = _kept(batch, field, len(scenarios), kept.every, points)
     facts = {
         "wall_time": clock.seconds,
         "simulation_time": simulated,
@@ -174,7 +158,7 @@ def _plants(
 
 
 def _kept(batch: TrajectoryBatch, field: str, lanes: int, every: int, points: int) -> np.ndarray:
-    """A trajectory at the stored times, filled up to their number."""
+    """A trajectory at the stored times, filled up to their number: shorter runs end in NaN (-1 for codes)."""
     variable = swept(field)
     values = np.asarray(batch.setpoint if field == "setpoint" else batch[field])[:lanes, ::every]
     out = np.full((lanes, points, *values.shape[2:]), variable.empty, dtype=variable.dtype)

@@ -35,7 +35,7 @@ from jaxmpc.programs.clock import Clock
 from studies.definition.comparison import ComparisonDefinition, ControllerDefinition
 from studies.run.progress import looks
 from studies.store.files import FORMAT, RESULTS, open_manifest, survey
-from studies.store.fingerprint import content_hash, made_now, source_hash
+from studies.store.fingerprint import content_hash, made_now, packages_hash, source_hash
 from studies.store.layout import Column, StoreLayout, process_axes
 from studies.store.reading import open_results, provenance
 from studies.store.trajectories import PLAN, RUN_VARIABLES, run_fields
@@ -69,7 +69,7 @@ def run_comparison(
         others: stores of other studies, for a new store to take equal runs from.
         schedule: models of the controllers with `ControllerDefinition.schedule`; None if there are none.
     """
-    code = {package: source_hash(package) for package in ("jaxmpc", "identify")}
+    code = packages_hash()
     inputs = {
         "plant": plant_facts,
         "reference": msgspec.to_builtins(definition.reference),

@@ -18,8 +18,9 @@ import xarray as xr
 from identify.logged.log import Log, read_log
 from identify.logged.tags import Tags, tags_of
 from identify.plants import model_of
+from jaxmpc.check import located
 from jaxmpc.controller.controller import Controller
-from jaxmpc.errors import InputError, near
+from jaxmpc.errors import InputError
 from jaxmpc.files import strict_json
 from jaxmpc.loop.replay import LEAST, Done, replay
 from jaxmpc.loop.trajectory import Trajectory
@@ -29,7 +30,7 @@ from jaxmpc.process.process import Process
 from studies.definition.comparison import ControllerDefinition
 from studies.run.comparison import labelled, progress_bar, results_layout, run_missing, shared_variables
 from studies.store.files import RESULTS
-from studies.store.fingerprint import content_hash, source_hash
+from studies.store.fingerprint import content_hash, packages_hash
 from studies.store.layout import StoreLayout
 from studies.store.writing import check_writable, locked
 
@@ -80,10 +81,8 @@ def run_replay(
         changes={"demand_lead": 0.0},  # every advice begins where the MVs stand
         position_feedback=True,
     )
-    presets = list(process.presets)
-    if preset and preset not in presets:
-        raise InputError("--preset", preset, f"one of {', '.join(presets)}", near(preset, presets))
-    controller.check(process, np.inf)
+    with located(lambda field: "--preset" if field == "tuning" else field):
+        controller.check(process, np.inf)
     name = f"{process.name}-{re.sub('[^A-Za-z0-9_.-]', '-', Path(log).stem)}-replay"
     folder = check_writable(Path(out) / name)
     model = model_of(process)
@@ -157,7 +156,7 @@ def _layout(
     read: Log,
 ) -> StoreLayout:
     """The store of a replay: a comparison of one controller, its samples at the times of the log."""
-    code = {package: source_hash(package) for package in ("jaxmpc", "identify")}
+    code = packages_hash()
     told = [np.asarray(getattr(done, key)) for key in ("time", "cv", "setpoint", "mv", "dv")]
     stretches = [[own.start, own.stop] for own in done.stretches]
     inputs: dict[str, Any] = {

@@ -24,7 +24,7 @@ from studies.definition.models import Point as WorkingPoint
 from studies.definition.models import identify_models
 from studies.definition.scenarios import Study
 from studies.kpi.objectives import costs, front, unbeaten, values_of
-from studies.run.chunk import run_scenarios, stored_times
+from studies.run.chunk import run_scenarios
 from studies.run.progress import Progress, progress_bar
 from studies.run.runner import Say
 from studies.search.space import Parameter, Point
@@ -129,19 +129,9 @@ class _Runner:
         wanted = batch.model_points if self.models else (*self.study.probe.model_points, *batch.model_points)
         new = identify_models(batch.process, (point for point in wanted if point not in self.models))
         self.models |= {point: jax.tree.map(np.asarray, model) for point, model in new.items()}
-        store = batch.definition.store
-        return run_scenarios(
-            [batch.scenario(k) for k in range(batch.count)],
-            self.models,
-            lanes=batch.count,
-            points=len(stored_times(batch)),
-            every=store.every,
-            trajectories=store.trajectories,
-            shared_model=self.shared_model,
-            process=batch.process,
-            plant=batch.definition.study.plant,
-            varying=self.plant,
-        )
+        scenarios = [batch.scenario(k) for k in range(batch.count)]
+        options: Any = {"shared_model": self.shared_model, "varying": self.plant}
+        return run_scenarios(batch, scenarios, self.models, lanes=batch.count, **options)
 
 
 class _Stored:

@@ -24,7 +24,7 @@ import numpy as np
 
 # Modules of `jaxmpc` that no closed loop depends on.
 EDGE_FOLDERS = ("cli", "steady")
-EDGE_MODULES = ("html", "controller/case", "controller/plan")
+EDGE_MODULES = ("html", "controller/case", "controller/given", "controller/plan")
 
 
 def content_hash(*parts: Any) -> str:
@@ -61,6 +61,11 @@ def source_hash(package: str) -> str:
         if name not in EDGE_MODULES and name.split("/")[0] not in EDGE_FOLDERS:
             trees[name] = ast.dump(_without_docstrings(ast.parse(path.read_text())))
     return content_hash(trees)
+
+
+def packages_hash() -> dict[str, str]:
+    """`source_hash` of the packages that every closed loop depends on, by name."""
+    return {package: source_hash(package) for package in ("jaxmpc", "identify")}
 
 
 @functools.cache

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from jaxmpc.check import require
+from jaxmpc.check import among
 from studies.definition.catalogue import Comparison, load_comparison
 from studies.run.named import run_named
 from studies.thesis.steady import steady_variables
@@ -24,7 +24,7 @@ def study_name(name: str, quick: bool, plant: str) -> str:
     Raises:
         InputError: for an unknown plant.
     """
-    require(plant in PLANTS, "plant", plant, f"one of {', '.join(PLANTS)}")
+    among("plant", plant, PLANTS)
     return f"{name}-{'quick-' if quick else ''}{plant}"
 
 
@@ -34,7 +34,7 @@ def comparison_of(name: str, quick: bool = False, plant: str = PLANTS[0]) -> Com
     Raises:
         InputError: for an unknown name or plant.
     """
-    require(name in STUDIES, "study", name, f"one of {', '.join(STUDIES)}")
+    among("study", name, STUDIES)
     study_name(name, quick, plant)
     return load_comparison(name, quick=quick, plant=plant)
 

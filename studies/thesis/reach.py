@@ -34,11 +34,21 @@ def distance_to_reach(data: xr.Dataset, refine: int = 8) -> np.ndarray:
     return np.nanmin(away.max(axis=-1), axis=(1, 2))
 
 
+def choke_moves(run: xr.Dataset) -> np.ndarray:
+    """Moves of the actual choke position, ``"sample"`` [%]; none in the first sample of a part of a run."""
+    choke = run.sel(mv=CHOKE)
+    position, whole = choke.position.values, float(run.time.values[0]) == 0.0
+    start = choke.demand.values[0] - choke.move.values[0] if whole else position[0]  # as in the key figures
+    return np.asarray(kpi.moves_of(position, start))
+
+
+def turns(run: xr.Dataset, segment: np.ndarray | None = None, smallest: float = 0.0) -> np.ndarray:
+    """Whether the choke turns back, both moves in one segment and larger than the smallest [%], ``"sample"``."""
+    return np.asarray(kpi.reversal_events(choke_moves(run), smallest, segment=segment))
+
+
 def reversals_near_closed(data: xr.Dataset, controller: str) -> int:
     """Reversals of the choke in the second halves of the setpoint windows after which it stands below `NEAR_CLOSED`."""
-    run, at = data.sel(controller=controller), WELL.mv_names.index(CHOKE)
-    position, demand, move = (run[name].values[:, at] for name in ("position", "demand", "move"))
-    actual = kpi.moves_of(position, demand[0] - move[0])
-    late = kpi.second_halves(data.window.values)
-    hunting = np.asarray(kpi.reversal_events(actual, WELL.mvs[at].smallest_move, segment=late))
-    return int((hunting & (position < NEAR_CLOSED)).sum())
+    run, smallest = data.sel(controller=controller), WELL.mvs[WELL.mv_names.index(CHOKE)].smallest_move
+    hunting = turns(run, kpi.second_halves(data.window.values), smallest)
+    return int((hunting & (run.position.sel(mv=CHOKE).values < NEAR_CLOSED)).sum())

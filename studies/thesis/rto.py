@@ -30,7 +30,7 @@ from jaxmpc.steady.map import SteadyMap
 from jaxmpc.steady.optimise import Targets, optimise
 from studies.run.comparison import labelled, progress_bar, results_layout, run_missing
 from studies.store.files import RESULTS
-from studies.store.fingerprint import content_hash, module_hash, source_hash
+from studies.store.fingerprint import content_hash, module_hash, packages_hash
 from studies.store.layout import StoreLayout
 from studies.store.reading import open_results
 from studies.store.writing import check_writable, locked
@@ -145,8 +145,7 @@ def _layout(
     shared: dict[str, xr.DataArray],
 ) -> StoreLayout:
     """The store of both runs, known by their inputs."""
-    code = {package: source_hash(package) for package in ("jaxmpc", "identify")}
-    code |= {name: module_hash(name) for name in OPTIMISING}
+    code = packages_hash() | {name: module_hash(name) for name in OPTIMISING}
     inputs = {
         "plant": facts,
         "model": np.asarray(model.coefficients),

@@ -13,7 +13,8 @@ import numpy as np
 import xarray as xr
 
 from jaxmpc.controller.controller import Controller
-from jaxmpc.controller.core import ControllerState, Core
+from jaxmpc.controller.core import Core
+from jaxmpc.controller.state import ControllerState
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.process.process import Process
 from jaxmpc.status import LIMIT

@@ -352,9 +352,9 @@ def test_every_comparison_can_be_named_on_the_command_line():
 def test_figures_are_listed_without_an_id_and_produced_with_one(stub, tmp_path, capsys):
     given = []
     stub("figures.registry", FIGURES={"12": SimpleNamespace(title="a title", study="soft")})
-    stub("figures.produce", produce=lambda ids, **rest: given.append((ids, rest)) or [tmp_path / "f.png"])
     stub(
-        "figures.gallery",
+        "figures.produce",
+        produce=lambda ids, **rest: given.append((ids, rest)) or [tmp_path / "f.png"],
         write_gallery=lambda ids, **rest: given.append((ids, rest)) or tmp_path / "index.html",
     )
     assert main(["figures"]) == 0

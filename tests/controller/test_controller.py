@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from jaxmpc import status
-from jaxmpc.controller.bias import filter_bias
 from jaxmpc.controller.controller import Controller
+from jaxmpc.controller.state import filter_bias
 from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import make_model
 from jaxmpc.problem.layout import Size, layout_of

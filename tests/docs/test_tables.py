@@ -11,7 +11,7 @@ from identify.foreign.septic_meaning import MEANINGS
 from jaxmpc.problem.declared import declared
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning
-from jaxmpc.process import file
+from jaxmpc.process import file, variables
 from jaxmpc.process.responses import TransferFunctionSection
 from studies.definition.fields import study_fields
 from studies.thesis.well import WELL
@@ -88,15 +88,15 @@ TABLES = {
 
 SECTIONS = {  # tables of a process file by their headings in processes.md
     "### At the top": file.ProcessFile,
-    "### `[[cv]]`: controlled variables": file.CvSection,
-    "### `[[mv]]`: manipulated variables": file.MvSection,
-    "### `actuator`: what becomes of a demand": file.ActuatorSection,
-    "### `[[disturbance]]`: what else moves the CVs": file.VariableSection,
-    "### `[model]`: what the controller predicts with": file.ModelSection,
+    "### `[[cv]]`: controlled variables": variables.Cv,
+    "### `[[mv]]`: manipulated variables": variables.Mv,
+    "### `actuator`: what becomes of a demand": variables.ActuatorSection,
+    "### `[[disturbance]]`: what else moves the CVs": variables.Variable,
+    "### `[model]`: what the controller predicts with": variables.ModelSource,
     "### `transfer_functions`: entries of the list": TransferFunctionSection,
-    "### `[plants.NAME]`: what is controlled": file.PlantSection,
+    "### `[plants.NAME]`: what is controlled": variables.PlantSource,
     "### `[references.NAME]` and `[disturbances.NAME]`: over time": file.WindowsSection,
-    "### `[[key_figure]]`: integrals of your own": file.KeyFigureSection,
+    "### `[[key_figure]]`: integrals of your own": variables.KeyFigure,
 }
 
 
@@ -119,11 +119,11 @@ def test_the_page_of_processes_has_every_key_with_its_default(heading, section):
     rows = [line.split("|")[1:5] for line in parts("processes.md", heading)[1].splitlines()[2:]]
     told = {key.strip(" `"): default.strip(" `") for key, _, default, _ in rows}
     fields = msgspec.structs.fields(section)
-    assert set(told) == {field.name for field in fields}
+    assert set(told) == {field.encode_name for field in fields}
     for field in fields:
-        assert (told[field.name] == "required") == field.required, field.name
+        assert (told[field.encode_name] == "required") == field.required, field.name
         if isinstance(field.default, (int, float)) and field.name != "settled":  # which 0 leaves to the span
-            assert told[field.name] == f"{field.default:g}"
+            assert told[field.encode_name] == f"{field.default:g}"
 
 
 @pytest.mark.parametrize("kind", [Structure, Tuning])

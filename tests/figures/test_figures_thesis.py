@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from figures import gallery, produce, registry, style
+from figures import produce, registry, style
 from figures.page import heading
 from figures.thesis import events, integer_example, plans, soft
 from jaxmpc.errors import InputError
@@ -445,7 +445,7 @@ class Reader(HTMLParser):
 
 @pytest.fixture(scope="module")
 def page(drawn):
-    path = gallery.write_gallery(["all"], drawn[0], drawn[1], True, "jax")
+    path = produce.write_gallery(["all"], drawn[0], drawn[1], True, "jax")
     assert path == drawn[1] / "index.html"
     return path.read_text()
 
@@ -487,12 +487,12 @@ def test_the_page_names_every_figure_with_its_study_function_and_command(page):
 
 def test_a_page_without_its_pictures_is_refused(drawn, tmp_path):
     with pytest.raises(InputError, match="the picture of figure 12"):
-        gallery.write_gallery(["12"], drawn[0], tmp_path, True, "jax")
+        produce.write_gallery(["12"], drawn[0], tmp_path, True, "jax")
     assert not list(tmp_path.iterdir())
 
 
 def test_a_page_of_some_figures_has_only_those(drawn, tmp_path):
     for name in ("figure_3_relaxation", "figure_33_pressure"):
         (tmp_path / f"{name}.png").write_bytes((drawn[1] / f"{name}.png").read_bytes())
-    path = gallery.write_gallery(["33", "3"], drawn[0], tmp_path, True, "jax")
+    path = produce.write_gallery(["33", "3"], drawn[0], tmp_path, True, "jax")
     assert len(Reader(path.read_text()).of("img")) == 2

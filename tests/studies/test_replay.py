@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -222,7 +223,7 @@ def test_what_does_not_exist_is_refused_before_anything_is_written(
 
 
 def test_a_missing_tag_is_named(process, logged, tmp_path):
-    other = dataclasses.replace(process, mvs=(dataclasses.replace(process.mvs[0], tag="FV-2"),))
+    other = dataclasses.replace(process, mvs=(msgspec.structs.replace(process.mvs[0], tag="FV-2"),))
     with pytest.raises(InputError, match="FV-2"):
         run_replay(other, written(tmp_path / "log.csv", logged[1]), tmp_path, progress=False)
 

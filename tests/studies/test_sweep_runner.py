@@ -146,10 +146,10 @@ def test_scenarios_of_a_study_differ_in_everything_that_may_differ_per_lane(stud
 
 
 def test_numbers_do_not_depend_on_the_scenarios_that_share_a_chunk(study, prepared):
-    options = dict(lanes=3, points=8, every=4, trajectories=("cv", "mv"))
-    options |= {"varying": study.varying_plant(0), "process": WELL}
-    one, _ = run_scenarios([study.scenario(7)], prepared.models, **options)
-    with_others, facts = run_scenarios([study.scenario(k) for k in (7, 1, 2)], prepared.models, **options)
+    options = dict(lanes=3, varying=study.varying_plant(0))
+    one, _ = run_scenarios(study, [study.scenario(7)], prepared.models, **options)
+    several = [study.scenario(k) for k in (7, 1, 2)]
+    with_others, facts = run_scenarios(study, several, prepared.models, **options)
     assert (facts["lanes"], facts["scenarios"]) == (3, 3)
     for name in set(one) - set(CLOCK):
         assert one[name].shape[0] == 1

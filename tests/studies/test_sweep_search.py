@@ -87,11 +87,11 @@ class Quick:
     def __init__(self, failing=(), scale=1.0):
         self.failing, self.scale, self.computed = failing, scale, 0
 
-    def __call__(self, scenarios, models, *, lanes, trajectories, **_):
+    def __call__(self, study, scenarios, models, *, lanes, **_):
         assert lanes == len(scenarios)
         fields = {
             v.name: np.full((lanes, *(LENGTHS[axis] for axis in v.dims)), 0, v.dtype)
-            for v in stored_variables(WELL, trajectories)
+            for v in stored_variables(WELL, study.definition.store.trajectories)
         }
         weight = np.array([float(s.tuning.move_weight[0]) for s in scenarios])
         lift = np.array([float(s.tuning.move_weight[1]) for s in scenarios])
@@ -528,8 +528,7 @@ def test_a_stored_scenario_is_the_run_of_its_tuned_values(real):
         assert evaluated.scenario_hash(k) == data.scenario_hash.values[k]
     models = identify_models(WELL, [evaluated.scenario(7).model_point])
     # with the lanes of the search, which then has its program
-    options = dict(lanes=4, shared_model=True, points=2, every=10, trajectories=(), process=WELL)
-    fields, _ = run_scenarios([evaluated.scenario(7)], models, **options)
+    fields, _ = run_scenarios(evaluated, [evaluated.scenario(7)], models, lanes=4, shared_model=True)
     for kpi in kpis_of(WELL):
         if kpi.name not in CLOCK:
             stored = data[kpi.name].values[7]

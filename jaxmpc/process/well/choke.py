@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from types import MappingProxyType
 
+from jaxmpc.check import among
 from jaxmpc.errors import InputError
 from jaxmpc.process.actuator import Actuator
 
@@ -20,8 +21,7 @@ LIFT = Actuator(low=0.0)
 
 def check_choke(actuator: object, path: str = "actuator") -> str:
     """Return the name of a choke actuator, or raise `InputError` if there is none of that name."""
-    if actuator not in CHOKES:
-        raise InputError(path, actuator, f"one of {', '.join(CHOKES)}")
+    among(path, actuator, CHOKES)
     return str(actuator)
 
 

@@ -21,7 +21,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jaxmpc.check import as_floats
+from jaxmpc.check import among, as_floats
 from jaxmpc.errors import InputError
 from jaxmpc.files import read_json, write_atomically
 
@@ -277,8 +277,7 @@ def parameters_from_dict(body: Any, path: str = "well") -> WellParameters:
         raise InputError(path, body, "a mapping of parameter names to numbers")
     known = [field.name for field in fields(WellParameters)]
     for name, value in body.items():
-        if name not in known:
-            raise InputError(f"{path}.{name}", value, f"one of {', '.join(known)}")
+        among(f"{path}.{name}", name, known, "one of", value)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise InputError(f"{path}.{name}", value, "a number (SI units)")
     return check_parameters(WellParameters(**{k: float(v) for k, v in body.items()}), path)

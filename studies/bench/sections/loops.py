@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxmpc.controller.controller import Controllers
+from jaxmpc.controller.batch import Controllers
 from jaxmpc.loop.simulate import simulate_batch
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import Tuning

@@ -16,9 +16,10 @@ import numpy as np
 import xarray as xr
 
 from studies.kpi.evaluate import completed, key_figures
-from studies.kpi.loop import moves_of, travel
+from studies.kpi.loop import travel
 from studies.thesis.claims import limits
 from studies.thesis.claims.limits import LATE
+from studies.thesis.reach import choke_moves
 from studies.thesis.well import CHOKE, GAS, LIFT, OIL
 
 VERDICTS = ("holds", "holds in part", "does not hold", "not tested")
@@ -190,14 +191,7 @@ def late_deviation(run: Run) -> np.ndarray:
 
 def choke_travel(run: Run) -> float:
     """Travel of the actual choke position from the first sample on [%]."""
-    position = run.position.sel(mv=CHOKE).values
-    return float(travel(moves_of(position, position[0])))
-
-
-def quarters(window: np.ndarray) -> list[np.ndarray]:
-    """Samples of the last quarter of every setpoint window."""
-    groups = (np.flatnonzero(window == w) for w in range(int(window.max()) + 1))
-    return [samples[(3 * len(samples)) // 4 :] for samples in groups]
+    return float(travel(choke_moves(run)))
 
 
 def swing(values: np.ndarray, groups: list[np.ndarray]) -> np.ndarray:

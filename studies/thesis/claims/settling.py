@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from studies.kpi.evaluate import final_deviation
+from studies.kpi.evaluate import final_deviation, quarters
 from studies.kpi.loop import second_halves
 from studies.thesis.claims.comparison import hunting, off_windows
 from studies.thesis.claims.limits import FULL, NEARLY_CLOSED, OUT_OF_REACH, STATIONARY, STEP
-from studies.thesis.claims.record import Evidence, Finding, Run, index, name_of, quarters, short, swing
+from studies.thesis.claims.record import Evidence, Finding, Run, index, name_of, short, swing
 from studies.thesis.claims.why import compromise, exchange
 from studies.thesis.reach import NEAR_CLOSED, distance_to_reach
 from studies.thesis.well import CHOKE, GAS, OIL
@@ -34,7 +34,7 @@ def converges(evidence: Evidence, run: Run) -> Finding:
 
 def comes_to_rest(evidence: Evidence, run: Run) -> Finding:
     """CVs and choke stand still at the end of a window."""
-    groups = quarters(run.window.values)
+    groups = quarters(run)
     cv = (swing(run.measurement.values, groups) / run.tuning_deadzone.values).max(axis=1)
     position = run.position.sel(mv=CHOKE).values
     choke = swing(position, groups)
@@ -59,7 +59,7 @@ def oil_first(evidence: Evidence, run: Run) -> Finding:
     out = distance_to_reach(data) > OUT_OF_REACH
     if not out.any():
         return Finding((), {}, instead="no target is out of reach")
-    target = np.array([run.setpoint.values[samples[0]] for samples in quarters(data.window.values)])
+    target = np.array([run.setpoint.values[samples[0]] for samples in quarters(data)])
     away = final_deviation(data, name_of(run)) * run.tuning_deadzone.values
     share = 100 * np.abs(away / target)
     oil, gas = share[:, index(data, OIL)], share[:, index(data, GAS)]
@@ -75,7 +75,7 @@ def oil_first(evidence: Evidence, run: Run) -> Finding:
 
 def saturates(evidence: Evidence) -> Finding:
     """Both MVs end at their upper limits."""
-    last = quarters(evidence.data.window.values)[-1]
+    last = quarters(evidence.data)[-1]
     parts, full = [], []
     for run in evidence.runs:
         low, high = run.tuning_mv_low.values, run.tuning_mv_high.values
@@ -106,7 +106,7 @@ def spikes(evidence: Evidence) -> Finding:
 
 def bias_settles(evidence: Evidence, run: Run) -> Finding:
     """The bias stands still at the end of a window."""
-    groups = quarters(run.window.values)
+    groups = quarters(run)
     moved = (swing(run.bias.values, groups) / run.tuning_deadzone.values).max(axis=1)
     settled = moved <= STATIONARY
     numbers = {"settled": settled.sum(), "count": len(settled), "most": moved.max()}

@@ -6,8 +6,9 @@ import itertools
 
 import numpy as np
 
-from studies.kpi.loop import moves_of, reversal_events, second_halves
+from studies.kpi.loop import second_halves
 from studies.plans import plan_at
+from studies.thesis import reach
 from studies.thesis.claims.limits import FAR, FAR_MORE, HUNTING, MOST, NEARLY_CLOSED
 from studies.thesis.claims.record import Evidence, Finding, Run, index, name_of
 from studies.thesis.claims.why import horizon_cost
@@ -16,9 +17,7 @@ from studies.thesis.well import CHOKE, OIL
 
 def turns(run: Run) -> np.ndarray:
     """Whether the choke turns back, both moves in one setpoint window, ``"sample"``."""
-    position = run.position.sel(mv=CHOKE).values
-    start = run.demand.sel(mv=CHOKE).values[0] - run.move.sel(mv=CHOKE).values[0]
-    return np.asarray(reversal_events(moves_of(position, start), segment=run.window.values))
+    return reach.turns(run, run.window.values)
 
 
 def turns_by_window(run: Run) -> np.ndarray:
