@@ -18,10 +18,11 @@ import numpy as np
 
 from jaxmpc.integer.chain import Chain, whole
 from jaxmpc.integer.cuts import Cuts
-from jaxmpc.integer.feasible import MoveLimits, around, needed, position_limits, satisfied, tighten, within
+from jaxmpc.integer.feasible import MoveLimits, around, needed, position_limits, satisfied, within
 from jaxmpc.integer.host_search import Search, Steps
 from jaxmpc.integer.lower_bound import LowerModel, enumerate_below, exclude, radii
 from jaxmpc.integer.relaxer import LANES, Relaxations
+from jaxmpc.integer.symmetry import in_order, tighten_in_order
 from jaxmpc.relaxed.newton import WarmStart
 
 HELD = 2**27  # numbers that open nodes may keep, a gigabyte
@@ -171,7 +172,7 @@ class _Tree:
         if not children:
             return
         together = MoveLimits(*map(np.array, zip(*(child.limits for child in children), strict=True)))
-        together, possible = tighten(search.chains, together)
+        together, possible = tighten_in_order(search.chains, search.orders, together)
         chosen = np.flatnonzero(possible)
         if not len(chosen):
             return
@@ -218,7 +219,8 @@ class _Tree:
         high = np.minimum(limits.high, np.floor(np.clip(high, -1e15, 1e15) + 1e-9)).astype(int)
         search.discard(max(node.bound, cutoff))
         tight = MoveLimits(np.maximum(limits.lower, lower), np.minimum(limits.upper, upper), low, high)
-        tight, good = tighten(search.chains, MoveLimits(*(values[None] for values in tight)))
+        together = MoveLimits(*(values[None] for values in tight))
+        tight, good = tighten_in_order(search.chains, search.orders, together)
         return dataclasses.replace(node, limits=tight.lane(0)) if good[0] else None
 
     # ---- branching
@@ -403,7 +405,8 @@ class _Tree:
         """The node of a relaxed child within what its siblings have left; None where that is nothing."""
         assert child.solved is not None
         limits = _both(kept, child.limits)
-        tight, good = tighten(self.search.chains, MoveLimits(*(values[None] for values in limits)))
+        together = MoveLimits(*(values[None] for values in limits))
+        tight, good = tighten_in_order(self.search.chains, self.search.orders, together)
         if not good[0]:
             return None
         (result, lane), model, start = child.solved, parent.model, parent.start
@@ -494,6 +497,7 @@ class _Tree:
         points, bounds, _ = found
         if len(points):
             keep = satisfied(chains, points, limits.lower, limits.upper)
+            keep &= in_order(chains, search.orders, points)
             keep &= np.array([p.tobytes() not in search.seen for p in points], dtype=bool)
             points, bounds = points[keep], bounds[keep]
         first = max(len(self.cuts.list) - NEWEST, 0)

@@ -12,6 +12,7 @@ from jaxmpc.integer.cuts import Cuts
 from jaxmpc.integer.feasible import satisfied
 from jaxmpc.integer.host_search import Search, Steps
 from jaxmpc.integer.lower_bound import LowerModel, enumerate_below
+from jaxmpc.integer.symmetry import in_order
 
 MOST = 20_000  # partial candidates alive at once from which the list is given up
 CELLS = 600_000  # the same in single moves, for long horizons
@@ -47,6 +48,7 @@ def enumerate_all(
     search.discard(search.cutoff)
     points, bounds, _ = found
     keep = satisfied(search.chains, points, lower, upper) if len(points) else np.zeros(0, dtype=bool)
+    keep &= in_order(search.chains, search.orders, points)
     keep &= np.array([p.tobytes() not in search.seen for p in points], dtype=bool)
     points, bounds = points[keep], bounds[keep]
     bounds = np.maximum(bounds, cuts.bounds(points))

@@ -21,6 +21,7 @@ from jaxmpc.integer.followed import followed
 from jaxmpc.integer.lower_bound import LowerModel
 from jaxmpc.integer.nearest import UndecidedError, held_within, nearest
 from jaxmpc.integer.relaxer import LaneLimits, Relaxations
+from jaxmpc.integer.symmetry import orders_of
 from jaxmpc.integer.tables import Constants
 from jaxmpc.problem.instance import QpInstance
 from jaxmpc.programs.clock import Clock
@@ -119,6 +120,8 @@ class Search:
         self.limits = np.asarray(instance.lower), np.asarray(instance.upper)
         self.chains: list[Chain] = chains_of(constants.structure, constants.size, instance, actuators)
         self.restricted = any(chain.restricted for chain in self.chains)
+        integer = constants.integer
+        self.orders = orders_of(constants, self.chains, *(limits[integer] for limits in self.limits))
         # whether it takes more than the chains to tell which whole moves can be followed
         self.followed = constants.structure.relaxed_moves and constants.size.windows > 0
         self.root, self.start = root, root.start(0)
