@@ -23,7 +23,7 @@ from jaxmpc.integer.host_search import Search, Steps
 from jaxmpc.integer.lower_bound import LowerModel, enumerate_below, exclude, radii
 from jaxmpc.integer.relaxer import LANES, Relaxations
 from jaxmpc.integer.symmetry import in_order, tighten_in_order
-from jaxmpc.relaxed.newton import WarmStart
+from jaxmpc.relaxed.newton import STEPS, WarmStart
 
 HELD = 2**27  # numbers that open nodes may keep, a gigabyte
 RELIABLE = 3  # branchings of a variable in a direction from which their gains are believed
@@ -178,7 +178,9 @@ class _Tree:
             return
         lower, upper = together.lower[chosen], together.upper[chosen]
         rows = needed(search.chains, MoveLimits(*(values[chosen] for values in together)))
-        result = yield from search.relax(lower, upper, [children[k].start for k in chosen], rows)
+        # a node that takes more steps is nearly singular, and a batch waits for its slowest; whole moves have to be solved
+        most = np.where((lower < upper).any(axis=1), STEPS, np.inf)
+        result = yield from search.relax(lower, upper, [children[k].start for k in chosen], rows, most)
         search.nodes += len(chosen)
         for lane, k in enumerate(chosen):
             children[k].limits, children[k].solved = together.lane(int(k)), (result, lane)

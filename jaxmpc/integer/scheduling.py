@@ -139,6 +139,7 @@ def _solve_together(relaxer: Relaxer, instances: QpInstance, some: list[tuple[_R
         index,
         jax.tree.map(join, *(request.limits for _, request in some)),
         jax.tree.map(join, *(request.starts for _, request in some)),
+        join(*(request.most for _, request in some)),
     )
     per_lane = clock.seconds / len(index)
     first = 0
@@ -153,22 +154,24 @@ def _solved_in_time(
 ) -> Relaxations | None:
     """As many of the lanes, the first ones, as are solved before the time limit of their search."""
     search, count, done = one.search, len(request.limits.lower), 0
-    some = lambda begin, end: jax.tree.map(lambda leaf: leaf[begin:end], (request.limits, request.starts))  # noqa: E731
+    all_of = request.limits, request.starts, request.most
+    some = lambda begin, end: jax.tree.map(lambda leaf: leaf[begin:end], all_of)  # noqa: E731
     parts = []
     while done < count:
         left = search.seconds_left()
         assert left is not None
         lanes = min(count - done, LANES)
-        if not request.evaluated:
+        if request.most.any():
             lanes = min(lanes, relaxer.pace.lanes_within(left))
         if not lanes:
             break
-        most = 0.0 if request.evaluated else relaxer.pace.steps_within(left / lanes)
+        in_time = relaxer.pace.steps_within(left / lanes)
+        *given, most = some(done, done + lanes)
         clock = Clock()
-        result = relaxer.solve(instances, np.full(lanes, one.number), *some(done, done + lanes), most)
+        result = relaxer.solve(instances, np.full(lanes, one.number), *given, np.minimum(most, in_time))
         search.spent += clock.seconds
         # a lane that the clock has stopped proves little, but its moves may be good
-        stopped = (result.steps >= most) & (result.status != OPTIMAL) & (not request.evaluated)
+        stopped = (result.steps >= in_time) & (result.status != OPTIMAL) & (most > 0.0)
         good = int(np.argmax(stopped)) if stopped.any() else lanes
         for lane in range(good, lanes):
             search.offer(result, lane)
