@@ -1,6 +1,6 @@
 """Equal actuators: of plans that differ only in which of them moves, one is kept.
 
-MVs whose responses (up to their sign), weights and limits (up to where they lie) are exactly equal may exchange their
+MVs whose responses (up to their sign), weights and limits (up to where they lie) are equal may exchange their
 positions at any time: with positions above the lower limit in decreasing order at every sample the predictions are the same,
 and neither the moves' squares nor their limits are exceeded, because of two sorted lists the entries of one rank lie closest
 together. So some best plan is in order, the one that starts furthest up being first, and branching and lists look at such
@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
@@ -33,6 +32,7 @@ class Ranked:
     shift: int
 
 
+ROUNDING = 1e-13  # of what is largest
 Order = tuple[Ranked, Ranked]  # the position of the first is nowhere below that of the second
 
 
@@ -44,31 +44,52 @@ def orders_of(constants: Constants, chains: Sequence[Chain], lower, upper) -> li
         chains: what whole moves must keep.
         lower, upper: limits of the moves, ``"integer"`` [steps].
     """
-    alike: dict[tuple, list[Ranked]] = defaultdict(list)
     if len(chains) < 2 or constants.qp.ideal is not None or constants.structure.relaxed_moves:
         return []
+    groups: list[tuple[_Told, list[Ranked]]] = []
     qp = constants.qp
     weight = np.asarray(qp.move_weight) + (np.asarray(qp.steep[0]) if len(qp.steep) else 0.0)
-    columns = np.asarray(qp.response) * constants.scales
     for chain in chains:
         if chain.restricted or len(chain.windows) or chain.coupled.any():
             continue
         place = constants.integer[chain.columns]
-        own = columns[:, place]
-        first = own.flat[np.argmax(own != 0.0)]
+        response = np.asarray(qp.response)[:, place] * constants.scales[place]
+        first = response.flat[np.argmax(response != 0.0)]
         sign = -1 if first < 0.0 else 1
         low, high, (least, most) = chain.low, chain.high, _own_limits(chain, lower, upper)
         if sign < 0:
             least, most, low, high = -most, -least, -high, -low
-        if (low != low[0]).any() or max(np.abs(low).max(), np.abs(high).max()) >= UNBOUNDED:
-            continue
-        told = (own * sign + 0.0, weight[place], chain.counts, least, most, high - low[0])
         longer = np.flatnonzero(chain.counts > 1)
-        ranked = Ranked(chain.columns[: longer[0] if len(longer) else None], sign, -int(low[0]))
-        if len(ranked.columns):
-            alike[tuple(part.tobytes() for part in told)].append(ranked)
-    groups = (sorted(group, key=lambda one: -one.shift) for group in alike.values())
-    return [pair for group in groups for pair in itertools.pairwise(group)]
+        columns = chain.columns[: longer[0] if len(longer) else None]
+        if (
+            (low != low[0]).any()
+            or max(np.abs(low).max(), np.abs(high).max()) >= UNBOUNDED
+            or not len(columns)
+        ):
+            continue
+        told = _Told(sign * response, weight[place], np.stack([chain.counts, least, most, high - low[0]]))
+        group = next((group for other, group in groups if told.equals(other)), None)
+        if group is None:
+            groups.append((told, group := []))
+        group.append(Ranked(columns, sign, -int(low[0])))
+    ranks = (sorted(group, key=lambda one: -one.shift) for _, group in groups)
+    return [pair for rank in ranks for pair in itertools.pairwise(rank)]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Told:
+    """All that a problem knows of an MV, where it stands apart."""
+
+    response: np.ndarray
+    weight: np.ndarray
+    limits: np.ndarray
+
+    def equals(self, other: _Told) -> bool:
+        """Whether nothing tells one MV from the other but rounding, as that of units."""
+        if not np.array_equal(self.limits, other.limits):
+            return False
+        pairs = (self.response, other.response), (self.weight, other.weight)
+        return all(np.abs(a - b).max() <= ROUNDING * np.abs(a).max() for a, b in pairs)
 
 
 def _own_limits(chain: Chain, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
