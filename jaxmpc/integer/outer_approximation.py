@@ -85,6 +85,9 @@ def outer_approximation(
         if bound >= search.cutoff:
             search.discard(search.cutoff)
             return True, best_bound
+        search.stopped = (
+            search.stopped or master.out_of_time
+        )  # by its own clock, which may run a little faster
         if point is None or not finished:
             return False, best_bound
         search.nodes += 1
