@@ -51,7 +51,7 @@ class Request:
 
 @dataclasses.dataclass(frozen=True)
 class Offload:
-    """Work outside the device (a MILP) that a search wants done in a thread."""
+    """Work outside the device (a MILP) that a search wants done in a thread; None comes back where its time ends before."""
 
     work: Callable[[], Any]
 

@@ -30,6 +30,8 @@ class _Run:
         self.number, self.search, self.steps = number, search, steps
         self.waits: Request | Offload | None = None
         self.future: concurrent.futures.Future | None = None
+        self.left: float | None = None  # seconds to the time limit when the work in the thread began,
+        self.began = Clock()  # and what has passed since
         self.result: SearchResult | None = None
 
     def send(self, value) -> None:
@@ -41,6 +43,32 @@ class _Run:
             self.waits, self.result = None, end.value
         self.search.spent += clock.seconds
         self.search.clock = None
+
+    def submit(self, pool: concurrent.futures.Executor) -> None:
+        """Begin the work that it waits for."""
+        assert isinstance(self.waits, Offload)
+        self.future = pool.submit(_timed, self.waits.work)
+        self.left, self.began = self.search.seconds_left(), Clock()
+
+    @property
+    def patience(self) -> float | None:
+        """Seconds that it still waits for the work in the thread, None for any time."""
+        return None if self.left is None else max(self.left - self.began.seconds, 0.0)
+
+    def collect(self) -> bool:
+        """Go on if the work in the thread has ended, or without it if its time has; whether work was left to itself."""
+        assert self.future is not None
+        late = not self.future.done() and self.patience == 0.0
+        if self.future.done():
+            value, seconds = self.future.result()
+        elif late:
+            value, seconds, self.search.stopped = None, self.began.seconds, True
+        else:
+            return False
+        self.future = None
+        self.search.spent += seconds
+        self.send(value)
+        return late
 
 
 def run(
@@ -73,7 +101,7 @@ def _run(relaxer: Relaxer, instances: QpInstance, runs: list[_Run]) -> list[Sear
     """Run searches to their ends."""
     for one in runs:
         one.send(None)
-    pool = None
+    pool, left_alone = None, False
     try:
         while any(one.result is None for one in runs):
             clock, active = Clock(), [one for one in runs if one.result is None]
@@ -82,7 +110,7 @@ def _run(relaxer: Relaxer, instances: QpInstance, runs: list[_Run]) -> list[Sear
                 if isinstance(one.waits, Offload) and one.future is None:
                     if pool is None:
                         pool = concurrent.futures.ThreadPoolExecutor(os.cpu_count())
-                    one.future = pool.submit(_timed, one.waits.work)
+                    one.submit(pool)
             asking = [one for one in runs if isinstance(one.waits, Request)]
             if asking:
                 _answer(relaxer, instances, asking)
@@ -90,21 +118,18 @@ def _run(relaxer: Relaxer, instances: QpInstance, runs: list[_Run]) -> list[Sear
             if waiting and not asking:
                 concurrent.futures.wait(
                     [one.future for one in waiting if one.future is not None],
+                    min((one.patience for one in waiting if one.patience is not None), default=None),
                     return_when=concurrent.futures.FIRST_COMPLETED,
                 )
             for one in waiting:
-                if one.future is not None and one.future.done():
-                    value, seconds = one.future.result()
-                    one.future = None
-                    one.search.spent += seconds
-                    one.send(value)
+                left_alone |= one.collect()
             # what was charged to nobody is what it takes to serve them
             served = clock.seconds - (sum(one.search.spent for one in active) - charged)
             for one in active:
                 one.search.spent += max(served, 0.0) / len(active)
     finally:
         if pool is not None:
-            pool.shutdown(wait=not being_left(), cancel_futures=True)
+            pool.shutdown(wait=not (being_left() or left_alone), cancel_futures=True)
     return [one.result for one in runs if one.result is not None]
 
 

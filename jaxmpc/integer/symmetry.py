@@ -4,7 +4,7 @@ MVs whose responses (up to their sign), weights and limits (up to where they lie
 positions at any time: with positions above the lower limit in decreasing order at every sample the predictions are the same,
 and neither the moves' squares nor their limits are exceeded, because of two sorted lists the entries of one rank lie closest
 together. So some best plan is in order, the one that starts furthest up being first, and branching and lists look at such
-plans only (Margot 2010, section 2, on orbits of equal columns). A move over several samples of a block may end where the
+plans only (Margot 2010 on symmetric integer programmes). A move over several samples of a block may end where the
 other's cannot: from the first such block on nothing is demanded. Oscillation rows, dwell, lists and windows are not kept by
 an exchange: MVs with them are left alone.
 """
