@@ -245,8 +245,7 @@ class ReducedMilp:
             "time_limit", 1e30 if seconds is None else float(self.highs.getRunTime() + max(seconds, 1e-3))
         )
         self.highs.run()
-        status = self.highs.getModelStatus()
-        info = self.highs.getInfo()
+        status, info = self.highs.getModelStatus(), self.highs.getInfo()
         self.out_of_time = status == highspy.HighsModelStatus.kTimeLimit
         if status == highspy.HighsModelStatus.kInfeasible:
             return np.inf, None, True

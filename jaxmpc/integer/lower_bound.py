@@ -23,9 +23,8 @@ from jaxmpc.integer.chain import Chain
 from jaxmpc.integer.feasible import MoveLimits, satisfied
 
 GRID = 1024  # combinations up to which all are evaluated at once
-CELLS = (
-    2**22
-)  # partial assignments times values of the next move that are kept: half a gigabyte with all that is made of them
+# partial assignments times values of the next move that are kept: half a gigabyte with all that is made of them
+CELLS = 2**22
 PIECE = 2**15  # of them that are looked at together: a millisecond
 
 

@@ -192,8 +192,7 @@ class Relaxer:
         most = np.broadcast_to(np.asarray(most, dtype=float), count)
         for begin in range(0, count, LANES):
             pad = np.minimum(begin + np.arange(LANES), count - 1)
-            some = jax.tree.map(lambda leaf, pad=pad: leaf[pad], (index, limits, starts, most))
-            *some, patience = some
+            *some, patience = jax.tree.map(lambda leaf, pad=pad: leaf[pad], (index, limits, starts, most))
             used = min(LANES, count - begin)
             clock = Clock()
             solved = _relax(self.qps, instances, *some, used, patience)
