@@ -20,6 +20,8 @@ from jaxmpc.integer.host_search import Search, Steps
 from jaxmpc.integer.relaxer import Relaxations
 from jaxmpc.integer.tables import Constants
 
+AT_ONCE = 1_000_000  # pairs of a point and a cut that are held against each other in one product
+
 
 def cut_of(constants: Constants, result: Relaxations, lane: int, lower, upper):
     """Value, place and gradient of R as one solved lane proves them.
@@ -47,18 +49,26 @@ class Cuts:
 
     Args:
         constants: of the scenario.
-        check_time: called between two cuts of many points; may raise to end it.
+        check_time: called between many points; may raise to end it.
     """
 
     def __init__(self, constants: Constants, check_time: Callable[[], None] = lambda: None):
         self.constants, self.check_time = constants, check_time
         self.list: list[tuple[float, np.ndarray, np.ndarray]] = []
+        # level and slope of each, less the curvature that all share, about the place of the first
+        self._levels: list[float] = []
+        self._slopes: list[np.ndarray] = []
 
     def add(self, result: Relaxations, lane: int, lower, upper) -> None:
         """Take the cut of a solved lane."""
         cut = cut_of(self.constants, result, lane, lower, upper)
         if np.isfinite(cut[0]) and np.isfinite(cut[2]).all():
             self.list.append(cut)
+            value, at, gradient = cut
+            away = at - self.list[0][1]
+            bent = self.constants.schur @ away
+            self._levels.append(value - away @ (gradient - 0.5 * bent))
+            self._slopes.append(gradient - bent)
 
     def solve(self, search: Search, points: np.ndarray, bounds: np.ndarray | None = None) -> Steps:
         """Solve whole moves ``"point integer"`` of known bounds, each for an incumbent and a cut."""
@@ -68,13 +78,18 @@ class Cuts:
 
     def bounds(self, points: Int[np.ndarray, "point integer"], first: int = 0) -> Float[np.ndarray, " point"]:
         """Lower bound of V at whole moves, by all cuts from number `first` on."""
-        c = self.constants
+        c, count = self.constants, len(self.list) - first
         best = np.full(len(points), -np.inf)
-        for value, at, gradient in self.list[first:]:
+        if not count:
+            return best
+        levels, slopes = np.array(self._levels[first:]), np.array(self._slopes[first:]).T
+        width = max(AT_ONCE // count, 1)
+        for begin in range(0, len(points), width):
             self.check_time()
-            away = points - at
-            curved = away @ c.root_factor
-            best = np.maximum(best, value + away @ gradient + 0.5 * np.einsum("pi,pi->p", curved, curved))
+            some = slice(begin, begin + width)
+            away = points[some] - self.list[0][1]
+            best[some] = (away @ slopes + levels).max(axis=1)
+            best[some] += 0.5 * ((away @ c.root_factor) ** 2).sum(axis=1)
         return best + (c.own_weight * points**2).sum(axis=1)
 
     def tangent(self, point: Int[np.ndarray, " integer"]):

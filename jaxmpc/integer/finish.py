@@ -26,6 +26,7 @@ from jaxmpc.integer.tables import Constants
 from jaxmpc.problem.instance import QpInstance
 from jaxmpc.problem.memory import check_ranges
 from jaxmpc.programs.clock import Clock
+from jaxmpc.programs.linear_algebra import one_thread
 from jaxmpc.relaxed.gap import closes
 from jaxmpc.relaxed.newton import MOST_STEPS
 from jaxmpc.status import LIMIT, OPTIMAL, UNPROVEN
@@ -33,6 +34,7 @@ from jaxmpc.status import LIMIT, OPTIMAL, UNPROVEN
 WIDEST_ENVELOPE = 4  # steps up to which the envelope of the squared integer move is built
 
 
+@one_thread()
 def finish_steps(
     relaxer_of: Callable[[int], Relaxer],
     instances: QpInstance,

@@ -80,6 +80,7 @@ class ReducedMilp:
         self.base = float(sum(own[i, 0] for i in range(len(lower)))) / unit
         self.first_column = {}
         self.forbidden: set[bytes] = set()
+        self.out_of_time = False  # whether its time limit has ended the last solve
         highs = self.highs = _silent_highs()
         for option, value in (
             ("threads", 1),
@@ -244,8 +245,8 @@ class ReducedMilp:
             "time_limit", 1e30 if seconds is None else float(self.highs.getRunTime() + max(seconds, 1e-3))
         )
         self.highs.run()
-        status = self.highs.getModelStatus()
-        info = self.highs.getInfo()
+        status, info = self.highs.getModelStatus(), self.highs.getInfo()
+        self.out_of_time = status == highspy.HighsModelStatus.kTimeLimit
         if status == highspy.HighsModelStatus.kInfeasible:
             return np.inf, None, True
         finished = status == highspy.HighsModelStatus.kOptimal

@@ -21,6 +21,7 @@ from jaxmpc.integer.followed import followed
 from jaxmpc.integer.lower_bound import LowerModel
 from jaxmpc.integer.nearest import UndecidedError, held_within, nearest
 from jaxmpc.integer.relaxer import LaneLimits, Relaxations
+from jaxmpc.integer.symmetry import orders_of
 from jaxmpc.integer.tables import Constants
 from jaxmpc.problem.instance import QpInstance
 from jaxmpc.programs.clock import Clock
@@ -39,18 +40,18 @@ GROUP = 8  # problems a search asks for at once: as many as one small batch hold
 class Request:
     """Relaxed problems a search wants solved: their limits and where to start, first axis ``"lane"``.
 
-    Where they are only `evaluated`, no Newton step is taken. The answer holds as many of them, the first ones, as the time
-    limit leaves time for; None for none.
+    Each is solved in its `most` Newton steps at most: where these are none, it is only evaluated. The answer holds as many
+    of them, the first ones, as the time limit leaves time for; None for none.
     """
 
     limits: LaneLimits
     starts: WarmStart
-    evaluated: bool = False
+    most: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True)
 class Offload:
-    """Work outside the device (a MILP) that a search wants done in a thread."""
+    """Work outside the device (a MILP) that a search wants done in a thread; None comes back where its time ends before."""
 
     work: Callable[[], Any]
 
@@ -119,6 +120,8 @@ class Search:
         self.limits = np.asarray(instance.lower), np.asarray(instance.upper)
         self.chains: list[Chain] = chains_of(constants.structure, constants.size, instance, actuators)
         self.restricted = any(chain.restricted for chain in self.chains)
+        integer = constants.integer
+        self.orders = orders_of(constants, self.chains, *(limits[integer] for limits in self.limits))
         # whether it takes more than the chains to tell which whole moves can be followed
         self.followed = constants.structure.relaxed_moves and constants.size.windows > 0
         self.root, self.start = root, root.start(0)
@@ -193,7 +196,7 @@ class Search:
         upper: np.ndarray,
         starts: list[WarmStart] | None = None,
         positions: tuple[np.ndarray, np.ndarray] | None = None,
-        evaluated: bool = False,
+        most: float | np.ndarray = np.inf,
     ) -> Steps:
         """Solve relaxed problems with integer limits ``"batch integer"``; returns `Relaxations`.
 
@@ -203,7 +206,8 @@ class Search:
             starts: prices to start from, one per problem; the root's if not given.
             positions: lower and upper limits of the position after every integer move [steps]; the problem's own if not
                 given.
-            evaluated: whether the moves of the starts are evaluated only.
+            most: Newton steps of a problem, or of each, after which it is taken as it is; 0 evaluates the moves of the
+                starts.
 
         Raises:
             OutOfTimeError: where there is no time for all of them; those that are solved were offered as incumbents.
@@ -219,7 +223,7 @@ class Search:
             stacked = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape)), self.start)
         else:
             stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *starts)
-        result = yield Request(limits, stacked, evaluated)
+        result = yield Request(limits, stacked, np.broadcast_to(np.asarray(most, dtype=float), count))
         self.stopped = self.stopped or result is None or len(result.bound) < count
         if result is None:
             raise OutOfTimeError
@@ -328,7 +332,7 @@ class Search:
         x[c.integer] = point
         start = dataclasses.replace(self.start, x=x)
         with contextlib.suppress(OutOfTimeError):
-            result = yield from self.relax(point[None], point[None], [start], evaluated=True)
+            result = yield from self.relax(point[None], point[None], [start], most=0.0)
             self.offer(result, 0)
 
     # ---- finishing

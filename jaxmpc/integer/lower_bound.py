@@ -13,7 +13,7 @@ whose bound stays below the incumbent can improve on it.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +23,9 @@ from jaxmpc.integer.chain import Chain
 from jaxmpc.integer.feasible import MoveLimits, satisfied
 
 GRID = 1024  # combinations up to which all are evaluated at once
-CELLS = 2**24  # partial assignments times values of the next move that are looked at together
+# partial assignments times values of the next move that are kept: half a gigabyte with all that is made of them
+CELLS = 2**22
+PIECE = 2**15  # of them that are looked at together: a millisecond
 
 
 class PositionPrices(NamedTuple):
@@ -172,7 +174,8 @@ def enumerate_below(
         return _grid_below(model, chains, lower, upper, sizes, cutoff)
     owner = {int(column): (k, b) for k, chain in enumerate(chains) for b, column in enumerate(chain.columns)}
     place = np.argsort(model.order)
-    moves = np.zeros((1, 0), dtype=int)
+    narrow = max(np.abs(lower).max(), np.abs(upper).max()) < np.iinfo(np.int16).max
+    moves = np.zeros((1, 0), dtype=np.int16 if narrow else int)  # long lists take memory
     bounds = np.array([model.value])
     position = np.zeros((1, len(chains)), dtype=int)
     least = np.inf
@@ -191,39 +194,57 @@ def enumerate_below(
             moves, bounds, position = moves[best], bounds[best], position[best]
         row, center = model.leading[i], model.center[model.order]
         own = model.excess[column, domain - model.lower[column]]
-        term = (moves @ row[:i] - row[: i + 1] @ center[: i + 1])[:, None] + row[i] * domain
-        reached = position[:, k, None] + chain.counts[b] * domain
-        total = bounds[:, None] + 0.5 * term**2 + own
-        if model.positions is not None and model.positions.price[column]:
-            total += np.maximum(model.positions.excess(column, reached), 0.0)
-        good = (reached >= chain.low[b]) & (reached <= chain.high[b])
-        if chain.coupled[b]:
-            good &= np.abs(domain - moves[:, place[chain.columns[b - 1]], None]) <= 1
-        if chain.allowed is not None:
-            good &= chain.passes(b, position[:, k, None], domain)
-        if chain.apart is not None:
-            near = [place[column] for column in chain.columns[:b][chain.apart[b, :b]]]
-            good &= (domain == 0) | (moves[:, near] == 0).all(axis=1, keepdims=True)
-        below = total < cutoff
-        if np.isfinite(cutoff):
-            out = good & ~below
-            least = min(least, total[out].min(initial=np.inf))
-        parents, chosen = np.nonzero(good & below)
-        bounds = total[parents, chosen]
-        if most is not None and len(bounds) > most:
-            return None
+        near = [] if chain.apart is None else chain.columns[:b][chain.apart[b, :b]]
+        found = []
+        for some in _pieces(len(bounds), check_time, max(len(domain), 1)):
+            before = position[some, k, None]
+            term = (moves[some] @ row[:i] - row[: i + 1] @ center[: i + 1])[:, None] + row[i] * domain
+            reached = before + chain.counts[b] * domain
+            total = bounds[some, None] + 0.5 * term**2 + own
+            if model.positions is not None and model.positions.price[column]:
+                total += np.maximum(model.positions.excess(column, reached), 0.0)
+            good = (reached >= chain.low[b]) & (reached <= chain.high[b])
+            if chain.coupled[b]:
+                good &= np.abs(domain - moves[some, place[chain.columns[b - 1]], None]) <= 1
+            if chain.allowed is not None:
+                good &= chain.passes(b, before, domain)
+            if len(near):
+                good &= (domain == 0) | (moves[some][:, place[near]] == 0).all(axis=1, keepdims=True)
+            below = total < cutoff
+            if np.isfinite(cutoff):
+                least = min(least, total[good & ~below].min(initial=np.inf))
+            parents, chosen = np.nonzero(good & below)
+            found.append((parents + some.start, chosen, total[parents, chosen]))
+            if most is not None and sum(len(part) for part, _, _ in found) > most:
+                return None
+        none = np.zeros(0, dtype=int)
+        parents, chosen, bounds = (
+            np.concatenate(part) for part in zip(*found or [(none, none, np.zeros(0))], strict=True)
+        )
         if beam is not None and len(bounds) > beam:
             best = np.argpartition(bounds, beam)[:beam]
             parents, chosen, bounds = parents[best], chosen[best], bounds[best]
-        moves = np.concatenate([moves[parents], domain[chosen, None]], axis=1)
+        longer = np.empty((len(parents), i + 1), dtype=moves.dtype)
+        for some in _pieces(len(parents), check_time):
+            longer[some, :i], longer[some, i] = moves[parents[some]], domain[chosen[some]]
+        moves = longer
         position = position[parents]
-        position[:, k] = reached[parents, chosen]
+        position[:, k] += chain.counts[b] * domain[chosen]
         if not len(moves):
             break
-    result = np.zeros((len(moves), len(owner)), dtype=int)
-    result[:, model.order[: moves.shape[1]]] = moves
     rank = np.argsort(bounds, kind="stable")
-    return result[rank], bounds[rank], least
+    result = np.zeros((len(moves), len(owner)), dtype=int)
+    for some in _pieces(len(moves), check_time):
+        result[some][:, model.order[: moves.shape[1]]] = moves[rank[some]]
+    return result, bounds[rank], least
+
+
+def _pieces(count: int, check_time: Callable[[], None], each: int = 1) -> Iterator[slice]:
+    """Parts of long arrays, of so many numbers per entry, with a look at the clock before each."""
+    width = max(PIECE // each, 1)
+    for begin in range(0, count, width):
+        check_time()
+        yield slice(begin, begin + width)
 
 
 def _grid_below(model: LowerModel, chains: list[Chain], lower, upper, sizes, cutoff: float):

@@ -71,7 +71,10 @@ def outer_approximation(
         master.set_cutoff(
             max(search.cutoff, witness + 0.1 * slack) if np.isfinite(witness) else search.cutoff
         )
-        bound, point, finished = yield Offload(lambda left=left: master.solve(left))
+        solved = yield Offload(lambda left=left: master.solve(left))
+        if solved is None:
+            return False, best_bound
+        bound, point, finished = solved
         if bound > witness + slack:
             raise ContradictionError(contradiction(bound, witness, "a known plan"))
         if point is not None:
@@ -85,6 +88,9 @@ def outer_approximation(
         if bound >= search.cutoff:
             search.discard(search.cutoff)
             return True, best_bound
+        search.stopped = (
+            search.stopped or master.out_of_time
+        )  # by its own clock, which may run a little faster
         if point is None or not finished:
             return False, best_bound
         search.nodes += 1

@@ -113,11 +113,11 @@ class LaneLimits(NamedTuple):
 def _relax(qps: Lanes, instances: QpInstance, index, limits: LaneLimits, starts, count, most) -> Relaxed:
     """Relaxations of lanes that belong to the scenarios `index`; those from `count` on are not solved.
 
-    Each is solved in `most` Newton steps at most.
+    Each is solved in its `most` Newton steps at most.
     """
     pick = lambda tree: jax.tree.map(lambda leaf: leaf[index], tree)  # noqa: E731
 
-    def lane(own, instance, limits: LaneLimits, start, there):
+    def lane(own, instance, limits: LaneLimits, start, there, most):
         # limits of no width leave nothing to solve
         low, high = (jnp.where(there, v, 0.0) for v in (limits.lower, limits.upper))
         rows = limits.row_low, limits.row_high
@@ -125,7 +125,7 @@ def _relax(qps: Lanes, instances: QpInstance, index, limits: LaneLimits, starts,
         return relax(eqx.combine(own, qps.shared), instance, low, high, start, most=most)
 
     there = jnp.arange(LANES) < count
-    return jax.vmap(lane)(pick(qps.each), pick(instances), limits, starts, there)
+    return jax.vmap(lane)(pick(qps.each), pick(instances), limits, starts, there, most)
 
 
 def pace_of(size: Size) -> Pace:
@@ -176,7 +176,7 @@ class Relaxer:
         index: np.ndarray,
         limits: LaneLimits,
         starts: WarmStart,
-        most: float = np.inf,
+        most: float | np.ndarray = np.inf,
     ) -> Relaxations:
         """Solve relaxed problems.
 
@@ -185,18 +185,20 @@ class Relaxer:
             index: scenario of each lane.
             limits: of every lane, in place of those of its scenario.
             starts: moves and prices to start from, ``"lane"``.
-            most: Newton steps of a lane after which it is judged as it is; none evaluate the moves it starts from.
+            most: Newton steps of a lane, or of each, after which it is judged as it is; none evaluate the moves it
+                starts from.
         """
         count, parts = len(index), []
+        most = np.broadcast_to(np.asarray(most, dtype=float), count)
         for begin in range(0, count, LANES):
             pad = np.minimum(begin + np.arange(LANES), count - 1)
-            some = jax.tree.map(lambda leaf, pad=pad: leaf[pad], (index, limits, starts))
+            *some, patience = jax.tree.map(lambda leaf, pad=pad: leaf[pad], (index, limits, starts, most))
             used = min(LANES, count - begin)
             clock = Clock()
-            solved = _relax(self.qps, instances, *some, used, most)
+            solved = _relax(self.qps, instances, *some, used, patience)
             own = jax.tree.map(lambda leaf, used=used: np.asarray(leaf)[:used], solved)
             parts.append(Relaxations.of(own))
-            if most > 0:
+            if patience.any():
                 self.pace.took(clock.seconds, int(parts[-1].steps.sum()), used)
         return Relaxations.joined(parts)
 

@@ -30,6 +30,8 @@ class _Run:
         self.number, self.search, self.steps = number, search, steps
         self.waits: Request | Offload | None = None
         self.future: concurrent.futures.Future | None = None
+        self.left: float | None = None  # seconds to the time limit when the work in the thread began,
+        self.began = Clock()  # and what has passed since
         self.result: SearchResult | None = None
 
     def send(self, value) -> None:
@@ -41,6 +43,32 @@ class _Run:
             self.waits, self.result = None, end.value
         self.search.spent += clock.seconds
         self.search.clock = None
+
+    def submit(self, pool: concurrent.futures.Executor) -> None:
+        """Begin the work that it waits for."""
+        assert isinstance(self.waits, Offload)
+        self.future = pool.submit(_timed, self.waits.work)
+        self.left, self.began = self.search.seconds_left(), Clock()
+
+    @property
+    def patience(self) -> float | None:
+        """Seconds that it still waits for the work in the thread, None for any time."""
+        return None if self.left is None else max(self.left - self.began.seconds, 0.0)
+
+    def collect(self) -> bool:
+        """Go on if the work in the thread has ended, or without it if its time has; whether work was left to itself."""
+        assert self.future is not None
+        late = not self.future.done() and self.patience == 0.0
+        if self.future.done():
+            value, seconds = self.future.result()
+        elif late:
+            value, seconds, self.search.stopped = None, self.began.seconds, True
+        else:
+            return False
+        self.future = None
+        self.search.spent += seconds
+        self.send(value)
+        return late
 
 
 def run(
@@ -73,7 +101,7 @@ def _run(relaxer: Relaxer, instances: QpInstance, runs: list[_Run]) -> list[Sear
     """Run searches to their ends."""
     for one in runs:
         one.send(None)
-    pool = None
+    pool, left_alone = None, False
     try:
         while any(one.result is None for one in runs):
             clock, active = Clock(), [one for one in runs if one.result is None]
@@ -82,7 +110,7 @@ def _run(relaxer: Relaxer, instances: QpInstance, runs: list[_Run]) -> list[Sear
                 if isinstance(one.waits, Offload) and one.future is None:
                     if pool is None:
                         pool = concurrent.futures.ThreadPoolExecutor(os.cpu_count())
-                    one.future = pool.submit(_timed, one.waits.work)
+                    one.submit(pool)
             asking = [one for one in runs if isinstance(one.waits, Request)]
             if asking:
                 _answer(relaxer, instances, asking)
@@ -90,21 +118,18 @@ def _run(relaxer: Relaxer, instances: QpInstance, runs: list[_Run]) -> list[Sear
             if waiting and not asking:
                 concurrent.futures.wait(
                     [one.future for one in waiting if one.future is not None],
+                    min((one.patience for one in waiting if one.patience is not None), default=None),
                     return_when=concurrent.futures.FIRST_COMPLETED,
                 )
             for one in waiting:
-                if one.future is not None and one.future.done():
-                    value, seconds = one.future.result()
-                    one.future = None
-                    one.search.spent += seconds
-                    one.send(value)
+                left_alone |= one.collect()
             # what was charged to nobody is what it takes to serve them
             served = clock.seconds - (sum(one.search.spent for one in active) - charged)
             for one in active:
                 one.search.spent += max(served, 0.0) / len(active)
     finally:
         if pool is not None:
-            pool.shutdown(wait=not being_left(), cancel_futures=True)
+            pool.shutdown(wait=not (being_left() or left_alone), cancel_futures=True)
     return [one.result for one in runs if one.result is not None]
 
 
@@ -139,6 +164,7 @@ def _solve_together(relaxer: Relaxer, instances: QpInstance, some: list[tuple[_R
         index,
         jax.tree.map(join, *(request.limits for _, request in some)),
         jax.tree.map(join, *(request.starts for _, request in some)),
+        join(*(request.most for _, request in some)),
     )
     per_lane = clock.seconds / len(index)
     first = 0
@@ -153,22 +179,24 @@ def _solved_in_time(
 ) -> Relaxations | None:
     """As many of the lanes, the first ones, as are solved before the time limit of their search."""
     search, count, done = one.search, len(request.limits.lower), 0
-    some = lambda begin, end: jax.tree.map(lambda leaf: leaf[begin:end], (request.limits, request.starts))  # noqa: E731
+    all_of = request.limits, request.starts, request.most
+    some = lambda begin, end: jax.tree.map(lambda leaf: leaf[begin:end], all_of)  # noqa: E731
     parts = []
     while done < count:
         left = search.seconds_left()
         assert left is not None
         lanes = min(count - done, LANES)
-        if not request.evaluated:
+        if request.most.any():
             lanes = min(lanes, relaxer.pace.lanes_within(left))
         if not lanes:
             break
-        most = 0.0 if request.evaluated else relaxer.pace.steps_within(left / lanes)
+        in_time = relaxer.pace.steps_within(left / lanes)
+        *given, most = some(done, done + lanes)
         clock = Clock()
-        result = relaxer.solve(instances, np.full(lanes, one.number), *some(done, done + lanes), most)
+        result = relaxer.solve(instances, np.full(lanes, one.number), *given, np.minimum(most, in_time))
         search.spent += clock.seconds
         # a lane that the clock has stopped proves little, but its moves may be good
-        stopped = (result.steps >= most) & (result.status != OPTIMAL) & (not request.evaluated)
+        stopped = (result.steps >= in_time) & (result.status != OPTIMAL) & (most > 0.0)
         good = int(np.argmax(stopped)) if stopped.any() else lanes
         for lane in range(good, lanes):
             search.offer(result, lane)

@@ -1,8 +1,10 @@
 """Time limits as deadlines, and why a plan is not proven where no limit was reached."""
 
 import math
+import threading
 import time
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +12,8 @@ import pytest
 from jaxmpc.controller.case import make_case
 from jaxmpc.controller.plan import Planner
 from jaxmpc.integer import branch_and_bound, enumeration
+from jaxmpc.integer.host_search import Offload
+from jaxmpc.integer.scheduling import run
 from jaxmpc.integer.tighten import chord_weights
 from jaxmpc.programs import clock
 from jaxmpc.programs.pace import CALL, Pace
@@ -102,6 +106,22 @@ def test_what_is_not_stopped_by_a_time_limit_says_what_stopped_it(monkeypatch):
         assert "memory" in plan.reason
         assert plan.finished_by is None
         assert plan.gap > 1e-6
+
+
+def test_work_in_a_thread_that_outlasts_the_limit_is_left_alone():
+    ended = threading.Event()
+    search: Any = SimpleNamespace(
+        spent=0.0, clock=None, stopped=False, time_limit=0.01, seconds_left=lambda: 0.01
+    )
+
+    def steps():
+        answer = yield Offload(lambda: ended.wait(60.0))
+        return "left alone" if answer is None else "waited for"
+
+    nothing: Any = None
+    assert run(nothing, nothing, [(0, search, steps())]) == ["left alone"]
+    assert search.stopped
+    ended.set()
 
 
 def test_an_infeasible_step_says_so():

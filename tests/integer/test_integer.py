@@ -8,6 +8,7 @@ import pytest
 
 from jaxmpc import status
 from jaxmpc.integer import listing as compiled_lists
+from jaxmpc.integer import lower_bound
 from jaxmpc.integer import search as compiled_search
 from jaxmpc.integer.chain import Chain
 from jaxmpc.integer.cuts import Cuts
@@ -160,7 +161,7 @@ def problems(small_structure, small_tuning, well_like_model):
     return result
 
 
-def test_a_relaxed_solve_bounds_every_whole_plan_and_fixing_loses_no_better_one(problems):
+def test_a_relaxed_solve_bounds_every_whole_plan_and_fixing_loses_no_better_one(problems, monkeypatch):
     excluded = 0
     for constants, instance, points, values in problems:
         search = started(constants, instance)
@@ -181,6 +182,11 @@ def test_a_relaxed_solve_bounds_every_whole_plan_and_fixing_loses_no_better_one(
         found, bounds, _ = enumerate_below(model, search.chains, tight_low, tight_high, cutoff, None)
         assert {p.tobytes() for p in better} <= {p.tobytes() for p in found}
         assert (np.diff(bounds) >= 0).all()
+        with monkeypatch.context() as pieces:  # one partial assignment after the other
+            pieces.setattr(lower_bound, "GRID", 0)
+            pieces.setattr(lower_bound, "PIECE", 1)
+            again, _, _ = enumerate_below(model, search.chains, tight_low, tight_high, cutoff, None)
+        assert {p.tobytes() for p in again} == {p.tobytes() for p in found}
     assert excluded > 6
 
 

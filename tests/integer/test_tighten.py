@@ -6,11 +6,12 @@ import pytest
 
 from jaxmpc import status
 from jaxmpc.integer import branch_and_bound, enumeration, lower_bound
-from jaxmpc.integer.branch_and_bound import _Node, _Tree
+from jaxmpc.integer.branching import Branchings
 from jaxmpc.integer.cuts import Cuts
 from jaxmpc.integer.feasible import MoveLimits, needed, position_limits, satisfied, within
 from jaxmpc.integer.finish import finish_steps
 from jaxmpc.integer.lower_bound import enumerate_below
+from jaxmpc.integer.nodes import Node
 from jaxmpc.integer.relaxer import Relaxer
 from jaxmpc.relaxed.problem import evaluate
 from tests.integer.test_integer import one
@@ -102,15 +103,15 @@ def test_what_a_tightened_relaxation_proves_holds_at_every_whole_point_of_its_li
 def test_what_branching_is_said_to_gain_holds_at_every_whole_point_of_both_children(problems):
     rng = np.random.default_rng(5)
     for problem, values in problems:
-        search, tree = problem.search, _Tree(problem.search, Cuts(problem.constants))
-        reached = problem.points @ tree.rows.T
+        search, branchings = problem.search, Branchings(problem.search)
+        reached = problem.points @ branchings.rows.T
         for limits in (problem.narrowed(rng) for _ in range(12)):
             own = limits.lane(0)
             rows = needed(search.chains, limits)
             result = problem.relaxed(limits.lower, limits.upper, None, rows)
             model = search.lower_model(result, 0, own.lower, own.upper)
             inside = satisfied(within(search.chains, own), problem.points, own.lower, own.upper)
-            for branching in tree._branchings(_Node(model.value, own, model, result.start(0))):
+            for branching in branchings.of(Node(model.value, own, model, result.start(0))):
                 down = reached[:, branching.row] <= branching.cut
                 for side, gain in zip((down, ~down), branching.estimate, strict=True):
                     least = values[inside & side].min(initial=np.inf)
