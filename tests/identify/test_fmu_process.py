@@ -14,10 +14,10 @@ import fmpy
 import numpy as np
 import pytest
 
-from identify import fmu_worker
+from identify import fmu_file, fmu_worker
 from identify.fmu import FmuPlant
+from identify.fmu_file import RefusedError, check_archive
 from identify.fmu_process import FmuProcess
-from identify.fmu_worker import RefusedError, check_archive
 from identify.well_fmu import WellFmuPlant
 from jaxmpc.errors import InputError, PlantError
 from tests import fmus
@@ -392,15 +392,15 @@ def test_an_archive_larger_than_allowed_or_than_the_disk_is_refused(tmp_path, mo
     check_archive(path, free=10**9)
     with pytest.raises(RefusedError, match="fits on the disk"):
         check_archive(path, free=100)
-    monkeypatch.setattr(fmu_worker, "MAX_FILES", 1)
+    monkeypatch.setattr(fmu_file, "MAX_FILES", 1)
     with pytest.raises(RefusedError, match="at most 1 files"):
         check_archive(path, free=10**9)
     monkeypatch.undo()
-    monkeypatch.setattr(fmu_worker, "MAX_BYTES", 100)
+    monkeypatch.setattr(fmu_file, "MAX_BYTES", 100)
     with pytest.raises(RefusedError, match="at most 100 bytes"):
         check_archive(path, free=10**9)
     monkeypatch.undo()
-    monkeypatch.setattr(fmu_worker, "MAX_DESCRIPTION_BYTES", 100)
+    monkeypatch.setattr(fmu_file, "MAX_DESCRIPTION_BYTES", 100)
     with pytest.raises(RefusedError, match=r"a modelDescription.xml of at most 100 bytes"):
         check_archive(path, free=10**9)
 
@@ -411,5 +411,5 @@ def test_a_table_of_contents_that_lies_about_a_size_unpacks_no_more_than_it_says
     path.write_bytes(content)
     check_archive(path, free=100_000)
     with pytest.raises(RefusedError, match="an undamaged FMU"):
-        fmu_worker.unpack(path, tmp_path / "out")
+        fmu_file.unpack(path, tmp_path / "out")
     assert sum(file.stat().st_size for file in (tmp_path / "out").rglob("*") if file.is_file()) < 100_000
