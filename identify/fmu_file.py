@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import stat
 import zipfile
@@ -20,6 +21,7 @@ MAX_RATIO = 200  # unpacked to packed size: XML packs 20 : 1, a bomb 1000 : 1
 MAX_DESCRIPTION_BYTES = 256 * 2**20
 
 DESCRIPTION = "modelDescription.xml"
+HARMFUL = re.compile(r"^[A-Z]+ \(line|not unique")  # of what FMPy finds: not of the schema, or ambiguous
 
 
 class RefusedError(Exception):
@@ -71,8 +73,12 @@ def unpack(path: Path, folder: Path, names: list[str] | None = None) -> None:
         raise RefusedError(f"an undamaged FMU ({type(error).__name__}: {error})") from None
 
 
-def read_description(path: Path, folder: Path) -> Any:
-    """FMPy's reading of the model description of an FMU of FMI 2.0 or 3.0, in a checked archive; refuses others."""
+def read_description(path: Path, folder: Path) -> tuple[Any, list[str]]:
+    """FMPy's reading of the model description of an FMU of FMI 2.0 or 3.0, in a checked archive; refuses others.
+
+    What breaks rules of the standard without any harm here is returned in words: units that are not defined, missing start
+    values and the like.
+    """
     from fmpy import read_model_description
 
     unpack(path, folder, [DESCRIPTION])
@@ -84,14 +90,18 @@ def read_description(path: Path, folder: Path) -> Any:
     if not re.match(r"2\.0|3\.", version):
         raise RefusedError(f"an FMU of FMI 2.0 or 3.0 (its version is {version})")
     try:
-        return read_model_description(folder)
+        return read_model_description(folder), []
     except Exception as error:  # FMPy has no type of its own for most of what it finds
+        flaws = getattr(error, "problems", ["units or display units that are not defined"])
         reason = " ".join(str(error).split())
-        raise RefusedError(f"a {DESCRIPTION} that follows the standard ({reason})") from None
+    with contextlib.suppress(Exception):
+        if not any(HARMFUL.search(flaw) for flaw in flaws):
+            return read_model_description(folder, validate=False), flaws
+    raise RefusedError(f"a {DESCRIPTION} that follows the standard ({reason})")
 
 
-def facts_of(described: Any, names: Iterable[str]) -> dict[str, Any]:
-    """What FMPy has read and the names of the files of the archive, for `identify.fmu_description`."""
+def facts_of(described: Any, flaws: list[str], names: Iterable[str]) -> dict[str, Any]:
+    """What FMPy has read, and the names of the files of the archive, for `identify.fmu_description`."""
     from fmpy import platform, platform_tuple
 
     fmi3 = described.fmiVersion.startswith("3")
@@ -111,6 +121,7 @@ def facts_of(described: Any, names: Iterable[str]) -> dict[str, Any]:
         "variables": [_facts_of(v) for v in described.modelVariables],
         "experiment": {name: number(getattr(experiment, own, None)) for name, own in times.items()},
         "variable_steps": bool(slave and slave.canHandleVariableCommunicationStepSize),
+        "flaws": flaws,
         "fixed_step": number(slave and slave.fixedInternalStepSize),
     }
 

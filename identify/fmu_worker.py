@@ -58,12 +58,12 @@ class Runner:
         self.path = Path(path)
         self._begin("the reading of its model description")
         check_archive(self.path, shutil.disk_usage(self.folder).free)
-        self._described = read_description(self.path, self.folder)
+        self._described, flaws = read_description(self.path, self.folder)
         self.fmi = 3 if self._described.fmiVersion.startswith("3") else 2
         self._references = {v.name: (v.type, v.valueReference) for v in self._described.modelVariables}
         self._shapes = {v.name: v.shape for v in self._described.modelVariables if v.shape}
         with zipfile.ZipFile(self.path) as archive:
-            return facts_of(self._described, archive.namelist())
+            return facts_of(self._described, flaws, archive.namelist())
 
     def load(self) -> None:
         """Unpack the FMU, load its library and instantiate it."""
@@ -115,7 +115,7 @@ class Runner:
             raise RefusedError(f"an FMU whose library lets itself be instantiated ({reason})") from None
 
     def start(self, values: dict[str, Any], inputs: dict[str, Any], stop: float | None) -> None:
-        """Begin a new run at time zero with start values, and inputs that hold from then on."""
+        """Begin a new run where its default experiment begins, or at time zero; inputs hold from then on."""
         if self._used:
             self._begin("reset")
             try:
@@ -123,21 +123,23 @@ class Runner:
             except Exception:  # many FMUs cannot: another instance begins anew, too
                 self._fmu.freeInstance()
                 self._instantiate()
-        self._time, self._used, self._stop = 0.0, True, stop
+        begin = number(getattr(self._described.defaultExperiment, "startTime", None)) or 0.0
+        stop = None if stop is None else begin + stop
+        self._time, self._used, self._stop = begin, True, stop
         self._exchange = None
         if self.fmi == 2:
             self._begin("setupExperiment")
-            self._fmu.setupExperiment(startTime=0.0, stopTime=stop)
+            self._fmu.setupExperiment(startTime=begin, stopTime=stop)
         self.set(values)
         self._begin("its initialisation")
-        self._fmu.enterInitializationMode(**({"startTime": 0.0, "stopTime": stop} if self.fmi == 3 else {}))
+        self._fmu.enterInitializationMode(**({"startTime": begin, "stopTime": stop} if self.fmi == 3 else {}))
         self.set(inputs)
         self._begin("its initialisation")
         self._fmu.exitInitializationMode()
         if self._described.coSimulation is None:
             from identify.fmu_exchange import Exchange
 
-            self._exchange, self._held = Exchange(self._fmu, self._described), dict(inputs)
+            self._exchange, self._held = Exchange(self._fmu, self._described, begin), dict(inputs)
 
     def change(self, values: dict[str, Any]) -> None:
         """Set variables while it runs; for model exchange in an event, and only those that change."""

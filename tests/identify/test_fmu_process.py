@@ -301,6 +301,21 @@ def description(old, new):
     return {"modelDescription.xml": fmus.describe().replace(old, new)}
 
 
+def test_a_description_that_breaks_rules_without_harm_is_used_and_its_flaws_are_told(tmp_path):
+    text = (
+        fmus.describe()
+        .replace('<Unit name="m3/h"/>', '<Unit name="bar"/>')
+        .replace('<Integer start="0"/>', "<Integer/>")
+    )
+    path = fmus.make_fmu(tmp_path, text)
+    with plant_of(path) as plant:
+        assert plant.description.flaws == (
+            'Variable "n" (line 9) has no start value.',
+            'The unit "m3/h" of variable "u" (line 8) is not defined.',
+        )
+        assert 'flaws       Variable "n"' in plant.description.table()
+
+
 LIBRARY = f"binaries/{fmpy.platform}/sum{fmpy.sharedLibraryExtension}"
 
 
