@@ -127,7 +127,7 @@ def test_the_posterior_is_that_of_conditioning_all_data_at_once():
 
 
 def test_the_factor_of_a_kernel_is_that_of_its_covariance():
-    low = np.asarray(factors(np.array([[0.5, np.log(3.0), np.log(7.0)]]), 9))[0]
+    low = np.asarray(factors(np.array([[0.5, np.log(3.0), np.log(7.0)]]), np.arange(9.0)))[0]
     lag = np.arange(1, 10)
     covariance = np.exp(0.5 - (lag[:, None] + lag) / 6.0 - np.abs(lag[:, None] - lag) / 7.0)
     np.testing.assert_allclose(low @ low.T, covariance, rtol=1e-12)
