@@ -257,7 +257,7 @@ class _Tests:
 
     def _identified(self, plant: FmuPlant, settle: float) -> Identification:
         self.tell("runs without steps")
-        longer = self._runs(plant, self.rest, 1, back=True)[0]
+        longer = self._there_and_back(plant, self.rest)
         still = np.concatenate([longer[None, : self.samples + 1], self._runs(plant, self.rest, 1)])
         scale = np.abs(still).max(axis=(0, 1))
         apart = np.abs(still[0] - still[1]).max(axis=0)
@@ -317,7 +317,16 @@ class _Tests:
     def _back(self, plant, j, one: Moved, longer: np.ndarray) -> tuple[str, Float[np.ndarray, "sample cv"]]:
         """The smallest test of an input and its way back: by how much the CVs differ from those without it."""
         way = min(one.targets, key=lambda way: (abs(one.targets[way] - one.rest), list(WAYS).index(way)))
-        return way, self._runs(plant, self._stepped(j, one.targets[way]), 1, back=True)[0] - longer
+        return way, self._there_and_back(plant, self._stepped(j, one.targets[way])) - longer
+
+    def _there_and_back(self, plant: FmuPlant, mv: np.ndarray) -> Float[np.ndarray, "sample cv"]:
+        """CVs of a run with held MVs and as long without; NaN where an FMU does not go that far."""
+        try:
+            return self._runs(plant, mv, 1, back=True)[0]
+        except PlantError:
+            plant.close()
+            run = self._runs(plant, mv, 1)[0]
+            return np.pad(run, ((0, self.samples), (0, 0)), constant_values=np.nan)
 
     def _tested(self, plant, j, one, base, noise, settle, means, first) -> tuple[int, np.ndarray]:
         """Make the tests of an input; returns how many runs each mean is of, and the noise as the runs show it."""

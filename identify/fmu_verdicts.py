@@ -23,6 +23,7 @@ CURVED, BENT = (
     0.05,
     0.5,
 )  # of a response: differences of its tests from which on to look, and not to use the mean
+GROWN = 1.05  # of a swing: from one third of a response to the next
 CONSTANT = 0.02  # of a slope: two that are one
 LEFT = 0.005  # of a response: error of its worst coefficient by noise, or by whole steps of a CV, from which on to look
 COARSE = 0.03  # likewise by whole steps, from which on not to use it
@@ -194,7 +195,7 @@ def back_share(change: Float[np.ndarray, "sample cv"], noise: Float[np.ndarray, 
     there, back = change[:count], change[-tenth:].mean(axis=0)
     moving = np.abs(there[-tenth:].mean(axis=0) - there[-2 * tenth : -tenth].mean(axis=0))
     beyond = np.abs(back) - 3 * moving - 6 * noise / math.sqrt(tenth)
-    return np.maximum(beyond, 0.0) / np.maximum(np.abs(there).max(axis=0), 1e-300)
+    return np.maximum(np.nan_to_num(beyond), 0.0) / np.maximum(np.abs(there).max(axis=0), 1e-300)
 
 
 def _stands_out(s: np.ndarray, error: float, expected: float) -> bool:
@@ -215,6 +216,8 @@ def _moving(s: np.ndarray, row: Settling, dt: float, per: str, error: float) -> 
     """Whether a response runs away, and what is to be said of one that still moves at its end."""
     if row.settled or len(s) < 8:
         return False, "" if row.settled else f"not settled by sample {len(s)}: give more samples"
+    if not error and (swings := _swinging(s)):
+        return swings
     quarter = len(s) // 4
     ends = [len(s) - k * quarter for k in (2, 1, 0)]
     slopes = [np.polyfit(np.arange(quarter) * dt, s[end - quarter : end], 1)[0] for end in ends]
@@ -237,6 +240,27 @@ def _moving(s: np.ndarray, row: Settling, dt: float, per: str, error: float) -> 
     left = -math.log(0.01) * quarter / max(math.log(max(abs(before), 1e-300) / max(abs(last), 1e-300)), 1e-3)
     more = f"; about {math.ceil(left / 50) * 50:d} samples would show it all" if 0 < left < 1e5 else ""
     return False, f"not settled by sample {len(s)}: it still moves {last:.3g}{per} each second{more}"
+
+
+def _swinging(s: np.ndarray) -> tuple[bool, str] | None:
+    """The same of a response that swings up to its end; None of one that does not."""
+    third = len(s) // 3
+    before, last = s[third : 2 * third], s[-third:]
+    if min(np.count_nonzero(np.diff(np.sign(np.diff(part)))) for part in (before, last)) < 2:
+        return None
+    ratio = float(np.ptp(last) / np.ptp(before))
+    if ratio > GROWN:
+        return (
+            True,
+            "it swings ever more: it is unstable, and a step response cannot model that; stabilise it first",
+        )
+    more = (
+        f"; about {math.ceil(third * math.log(0.01) / math.log(ratio) / 50) * 50:d} samples would show it all"
+    )
+    return (
+        False,
+        f"it still swings at sample {len(s)}{more if ratio < 1 / GROWN else ', and hardly less and less'}",
+    )
 
 
 def _sizes(tests: Tests, i: int, j: int, peak: float, error: float) -> tuple[float, str]:

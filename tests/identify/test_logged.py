@@ -333,6 +333,63 @@ def test_the_command_writes_a_model_and_a_page_and_refuses_what_is_for_fmus(tmp_
     assert not out.exists()
 
 
+PROCESS = """
+name = "own"
+dt = 1
+cv = [{ name = "level", unit = "m", tag = "y" }]
+mv = [{ name = "valve", unit = "%", tag = "a", low = 0, high = 100 }]
+disturbance = [{ name = "feed", unit = "t/h", tag = "b" }]
+
+[model]
+samples = 20
+working_point = { level = 2, valve = 50 }
+transfer_functions = [{ cv = "level", mv = "valve", gain = 1, time_constants = [3] }]
+
+[structure]
+prediction_horizon = 16
+control_horizon = 4
+blocks = [1, 1, 2]
+
+[presets.default]
+cv_weight = { level = 1 }
+move_weight = { valve = 0.001 }
+
+[references.day]
+duration = 1500
+windows = [[0, 2]]
+"""
+
+
+def test_the_command_takes_names_and_tags_of_a_process(tmp_path, moves):
+    y = response(FIRST, moves[:, 0]) + response(SECOND, moves[:, 1])
+    y = y + 0.1 * np.random.default_rng(9).normal(size=COUNT)
+    path, out = log_file(tmp_path / "log.csv", moves, y), tmp_path / "made.json"
+    process = tmp_path / "own.toml"
+    process.write_text(PROCESS)
+    words = ["identify", str(path), "--process", str(process), "--dv", "b", "--samples", str(LENGTH)]
+    assert cli.main([*words, "--out", str(out)]) == 0
+    model = StepResponseModel.load(out)
+    assert (model.cv_names, model.mv_names, model.dv_names) == (("level",), ("valve",), ("feed",))
+    assert (model.cv_units, model.mv_units, model.dv_units) == (("m",), ("%",), ("t/h",))
+
+
+def test_a_response_longer_than_can_be_fitted_is_sampled_more_coarsely(tmp_path):
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.normal(size=12), 500)
+    y, x = np.zeros(len(u)), 0.0
+    for k in range(len(u)):
+        y[k] = x
+        x += (2 * u[k] - x) / 200
+    path = log_file(tmp_path / "log.csv", u[:, None], y + 0.02 * rng.normal(size=len(u)))
+    found = identify_log(path, ["a"], ["y"])
+    dt = found.model.dt
+    exact = 2 * (1 - np.exp(-dt * np.arange(1, found.model.samples + 1) / 200))
+    assert dt > 1
+    assert found.verdicts[0].verdict == "good"
+    assert np.abs(found.responses[0, 0] - exact).max() < found.bands[0, 0].max() < 0.15
+    assert any("were made one" in note for note in found.notes)
+
+
 def test_a_cv_with_hardly_any_value_is_refused(tmp_path, moves):
     y = np.where(np.arange(COUNT) % 100 == 0, moves[:, 0], np.nan)
     path = log_file(tmp_path / "log.csv", moves, y)
