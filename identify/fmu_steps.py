@@ -90,8 +90,11 @@ def identify_fmu_schedule(
     *,
     told: Told | None = None,
     **more,
-) -> ModelSchedule:
+) -> tuple[ModelSchedule, dict[str, Identification]]:
     """A gain schedule: models as of `identify_fmu` over a grid of one or two of the MVs, from steps up and down.
+
+    Returns:
+        The schedule, and what was found at each place of the grid, by its words.
 
     Raises:
         InputError: as `identify_fmu`, and for a grid that is none.
@@ -111,11 +114,15 @@ def identify_fmu_schedule(
 
     prepared = [tests(place) for place in places]  # all are checked before any is simulated
     names = [one.channel for one in prepared[0].inputs if one.variable.name in at]
-    models = []
-    for number, one in enumerate(prepared, 1):
+    found = {}
+    for number, (place, one) in enumerate(zip(places, prepared, strict=True), 1):
         one.tell(f"working point {number} of {len(places)}")
-        models.append(one.identification().model)
-    return make_schedule(models, names)
+        words = ", ".join(
+            f"{name} = {value:g}" if is_number(value) else f"{name} = {value}"
+            for name, value in zip(names, place.values(), strict=True)
+        )
+        found[words] = one.identification()
+    return make_schedule([one.model for one in found.values()], names), found
 
 
 class _Tests:

@@ -132,7 +132,7 @@ def _pair(tests: Tests, i: int, j: int, row: Settling) -> tuple[Verdict, str]:
     if stays > HANGING:
         looks.append(
             f"{100 * stays:.2g} % of it stays when {row.mv} has gone back: backlash or hysteresis within the step, "
-            "or a part that is slower than the model; step further, and give more samples"
+            "or a part that is slower than the model; step further"
         )
     if not tests.continuous[i]:
         looks.append(
@@ -310,8 +310,9 @@ def advice_of(verdicts: Sequence[PairVerdict], model: StepResponseModel) -> tupl
         found.append(
             f"Give more samples than {model.samples} (--samples), or a longer sampling interval (--dt)."
         )
-    if "noise leaves" in says:
-        found.append("Give larger steps (--mv NAME=VALUE:STEP), which the noise hides less.")
+    hidden = {"noise leaves": "noise", "moves in steps of": "the steps of a CV", "has gone back": "backlash"}
+    if by := [what for words, what in hidden.items() if words in says]:
+        found.append(f"Give larger steps (--mv NAME=VALUE:STEP), which {' and '.join(by)} hide less.")
     if "it integrates" in says:
         found.append("Leave out CVs that integrate, or control them with a horizon that the model covers.")
     return tuple(found)

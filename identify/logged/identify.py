@@ -15,7 +15,18 @@ from typing import NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from identify.logged.fit import Data, Fit, bands, climbing, fitted, make_data, residuals, search, simulated
+from identify.logged.fit import (
+    Data,
+    Fit,
+    bands,
+    chosen,
+    climbing,
+    fitted,
+    make_data,
+    residuals,
+    search,
+    simulated,
+)
 from identify.logged.judge import excitations, verdict_of
 from identify.logged.log import LEAST, Log, read_log
 from identify.logged.low_order import LowOrder, low_order
@@ -49,6 +60,7 @@ class _Cv(NamedTuple):
     band: np.ndarray
     predicted: np.ndarray  # " sample" [CV unit]
     tested: Residuals
+    overruled: bool  # whether the part that was left out has decided against the likeliest noise
 
 
 def identify_log(
@@ -212,7 +224,7 @@ def _settled(data: Data, length: int) -> int:
 
 def _identified(data: Data, length: int, cut: int, signals: np.ndarray, moving: np.ndarray, bar: tqdm) -> _Cv:
     training = data.until(cut)
-    trained = search(training, length)
+    trained, overruled = chosen(data, length, cut)
     bar.update()
     final = fitted(data, length, trained, 30)
     bar.update()
@@ -229,7 +241,7 @@ def _identified(data: Data, length: int, cut: int, signals: np.ndarray, moving: 
     ]
     tested = examined(errors, signals, data.segments, length)
     fits = _fit(data, alone, cut), _fit(data, whole(rough), cut)
-    return _Cv(data, final, *fits, low, steps, band, alone, tested)
+    return _Cv(data, final, *fits, low, steps, band, alone, tested, overruled)
 
 
 def _replaced(fit: Fit, data: Data, band: np.ndarray) -> Fit:
@@ -269,6 +281,8 @@ def _verdict(cv: str, log: Log, name: str, excited, found: _Cv, j: int) -> PairV
         )
     elif _unsettled(s, found.band[j]):
         doubts.append(f"has not settled by sample {len(s)}: more --samples, or a larger --dt")
+    if found.overruled:
+        doubts.append(f"depends on what is taken for noise of {cv}, which its inputs do not move linearly")
     if tested.past[j] > tested.limit:
         doubts.append(
             f"residuals still follow moves of {name} (correlation {tested.past[j]:.2f}): slower or not linear"
@@ -317,6 +331,11 @@ def _method_notes(
         if own.final.free is not None:
             words += "; segments do not begin at rest, so that a free response was fitted at each beginning"
         notes.append(words)
+        if own.overruled:
+            notes.append(
+                f"{name}: with a drifting disturbance, likelier one sample ahead, the part that was left out is predicted "
+                "far worse; bands are too narrow"
+            )
         p = own.tested.white
         if p < WHITE:
             notes.append(f"{name}: residuals are not white (p = {p:.1g}): bands may be too narrow")

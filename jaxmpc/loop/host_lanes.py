@@ -7,6 +7,7 @@ all cores have work, and only the FMUs of the parts under way have a process.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -20,7 +21,7 @@ from jaxmpc.errors import PlantError
 from jaxmpc.loop.compiled import Inputs
 from jaxmpc.loop.events import Course, Stage
 from jaxmpc.loop.host import Told, recorded, undisturbed
-from jaxmpc.process.plant import StatefulPlant
+from jaxmpc.process.plant import StatefulPlant, closing
 from jaxmpc.programs.compilation import compiling_for
 from jaxmpc.programs.threads import parts_of, side_by_side
 
@@ -97,13 +98,11 @@ class _Run:
     ) -> tuple[dict[str, np.ndarray], dict[int, PlantError]]:
         """The whole run of a plant per lane; lanes without one are copies of the last."""
         self.alive[: len(plants)] = True
-        try:
+        with contextlib.ExitStack() as stack:
+            for plant in plants:
+                stack.enter_context(closing(plant))
             self._each(plants, lambda lane, plant: plant.init())
             records = self._samples(plants, tick, stopped)
-        finally:
-            for plant in plants:
-                if hasattr(plant, "close"):
-                    plant.close()
         return {name: np.stack([r[name] for r in records], axis=1) for name in records[0]}, self.failed
 
     def _samples(self, plants, tick, stopped) -> list[dict[str, np.ndarray]]:

@@ -241,11 +241,16 @@ def test_noise_is_averaged_and_what_it_leaves_is_told(tmp_path):
         ({"rates": "d[0] = (2 * u[0] - x[0]) / 1000"}, "look", "not settled by sample 60"),
         ({"rates": "d[0] = 0.01 * (x[0] + u[0] - 50)"}, "bad", "it is unstable"),
         ({"rates": "d[0] = -x[0]"}, "none", "no response"),
+        ({"rates": "d[0] = x[1]; d[1] = 0.01 * (u[0] - 50 - x[0]) - 0.003 * x[1]"}, "look", "it still swings at sample 60"),
+        ({"rates": "d[0] = x[1]; d[1] = 0.01 * (u[0] - 50 - x[0]) + 0.003 * x[1]"}, "bad", "it swings ever more"),
     ],
-    ids=["asymmetric", "turns", "curved", "integrator", "drifting integrator", "slow", "unstable", "none"],
+    ids=[
+        *("asymmetric", "turns", "curved", "integrator", "drifting integrator", "slow", "unstable", "none"),
+        *("swings", "swings ever more"),
+    ],
 )  # fmt: skip
 def test_a_pair_that_is_not_simply_linear_says_so(tmp_path, code, verdict, says):
-    path = plant(tmp_path, states=1, outputs="y[0] = x[0]", **code)
+    path = plant(tmp_path, states=2, outputs="y[0] = x[0]", **code)
     row = found(path, {"u": (None, 10.0)}).verdicts[0]
     assert (row.verdict, says in row.says) == (verdict, True), row
 
@@ -294,6 +299,13 @@ def test_an_output_of_whole_values_is_to_be_looked_at(tmp_path):
     row = found(path, {"u": (None, 5.0)}, ("alarm",)).verdicts[0]
     assert row.verdict in ("look", "bad")
     assert "whole values only" in row.says
+
+
+def test_an_fmu_that_ends_after_its_tests_is_identified_without_the_way_back(tmp_path):
+    code = LAG | {"initial": "x[0] = 100", "tick": "if (t > 900) { return 3; }"}
+    got = found(plant(tmp_path, **code))
+    assert off(got, EXACT) < CLOSE
+    assert got.verdicts[0].verdict == "good"
 
 
 def test_every_test_is_a_record_and_those_of_half_size_were_left_out(tmp_path):
@@ -440,6 +452,7 @@ def test_a_sweep_gives_a_gain_schedule_and_its_map(tmp_path, capsys):
     np.testing.assert_allclose(np.asarray(schedule.coefficients)[:, 0, 0, -1], [0.8, 2.0, 3.2], rtol=1e-6)
     told = capsys.readouterr().out
     assert "gain of u on y at u = 20: 0.8; u = 50: 2; u = 80: 3.2" in told
+    assert "at u = 80, u on y is good: gain 3.2 m per %, dead time 0 s, settled after 80 s" in told
     assert "u = 80: 3.2" in (tmp_path / "model.html").read_text()
     with pytest.raises(InputError, match="one of the MVs u"):
         identify_fmu_schedule(tmp_path / "plant.fmu", {"u": (None, None)}, ["y"], DT, N, {"w": [1.0, 2.0]})
