@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from figures.identification import write_page
+from identify.logged import fit as fit_module
 from identify.logged import identify_log
-from identify.logged.fit import bands, fitted, make_data, search, simulated
+from identify.logged.fit import bands, chosen, fitted, make_data, search, simulated
 from identify.logged.kernel import Posterior, estimate, factors
 from identify.logged.low_order import low_order
-from identify.logged.noise import Noise, likeliest, whitened
+from identify.logged.noise import WALK, Noise, likeliest, whitened
 from identify.logged.regression import Segment, sums
 from jaxmpc.cli import main as cli
 from jaxmpc.errors import InputError
@@ -311,6 +312,21 @@ def test_the_evidence_of_a_fit_does_not_depend_on_the_order_of_its_inputs(moves)
     swapped = dataclasses.replace(start, posterior=turned)
     other = fitted(make_data(y, moves[:, ::-1], [slice(0, COUNT)]), LENGTH, swapped, 0)
     assert other.posterior.score == pytest.approx(start.posterior.score, rel=1e-9)
+
+
+def test_unseen_samples_overrule_a_likely_fit_that_foresees_them_far_worse(moves, monkeypatch):
+    y = response(FIRST, moves[:, 0]) + 0.1 * np.random.default_rng(4).normal(size=COUNT)
+    data, cut = make_data(y, moves[:, :1], [slice(0, COUNT)]), round(0.73 * COUNT)
+    right, overruled = chosen(data, LENGTH, cut)
+    assert not overruled
+    posterior = dataclasses.replace(right.posterior, mean=-right.posterior.mean)
+    wrong = dataclasses.replace(
+        right, posterior=posterior, noise=WALK
+    )  # as one sample ahead may make it look
+    monkeypatch.setattr(fit_module, "search", lambda *_: wrong)
+    found, overruled = chosen(data, LENGTH, cut)
+    assert overruled
+    np.testing.assert_allclose(found.steps(data)[0], coefficients(FIRST), atol=0.1)
 
 
 def test_the_command_writes_a_model_and_a_page_and_refuses_what_is_for_fmus(tmp_path, moves, capsys):
