@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -26,8 +25,7 @@ from identify.fmu_verdicts import NOTHING, Tests, advice_of, back_share, grid_of
 from identify.names import legal_names
 from identify.step_test import SETTLE_SAMPLES
 from jaxmpc.check import is_count, is_number
-from jaxmpc.controller.schedule import ModelSchedule, make_schedule
-from jaxmpc.errors import InputError, PlantError, near
+from jaxmpc.errors import InputError, PlantError
 from jaxmpc.model.identification import Identification, Record
 from jaxmpc.model.step_response import StepResponseModel, make_model
 
@@ -76,57 +74,12 @@ def identify_fmu(
         InputError: for a file, variable, value or step that cannot be, before anything is simulated.
         PlantError: if the FMU fails.
     """
-    tests = _Tests(path, mvs, cvs, dt, samples, dvs or {}, start or {}, settle, time_limit, told)
+    tests = StepTests(path, mvs, cvs, dt, samples, dvs or {}, start or {}, settle, time_limit, told)
     return tests.identification()
 
 
-def identify_fmu_schedule(
-    path: str | Path,
-    mvs: Mapping[str, tuple[Value | None, float | None]],
-    cvs: Sequence[str],
-    dt: float,
-    samples: int,
-    at: Mapping[str, Sequence[Value]],
-    *,
-    told: Told | None = None,
-    **more,
-) -> tuple[ModelSchedule, dict[str, Identification]]:
-    """A gain schedule: models as of `identify_fmu` over a grid of one or two of the MVs, from steps up and down.
-
-    Returns:
-        The schedule, and what was found at each place of the grid, by its words.
-
-    Raises:
-        InputError: as `identify_fmu`, and for a grid that is none.
-    """
-    if len(at) not in (1, 2):
-        raise InputError("--at", list(at), f"values of one or two of the MVs {', '.join(mvs)}")
-    for mv, values in at.items():
-        if mv not in mvs:
-            raise InputError("--at", mv, f"one of the MVs {', '.join(mvs)}", near(mv, mvs))
-        if len(values) < 2 or len(set(values)) != len(values):
-            raise InputError(f"--at {mv}", list(values), "two or more distinct values")
-    places = [dict(zip(at, values, strict=True)) for values in itertools.product(*at.values())]
-
-    def tests(place: Mapping[str, Value]) -> _Tests:
-        there = {mv: (place.get(mv, value), step) for mv, (value, step) in mvs.items()}
-        return _Tests(path, there, cvs, dt, samples, told=told, ways=("up", "down"), **more)
-
-    prepared = [tests(place) for place in places]  # all are checked before any is simulated
-    names = [one.channel for one in prepared[0].inputs if one.variable.name in at]
-    found = {}
-    for number, (place, one) in enumerate(zip(places, prepared, strict=True), 1):
-        one.tell(f"working point {number} of {len(places)}")
-        words = ", ".join(
-            f"{name} = {value:g}" if is_number(value) else f"{name} = {value}"
-            for name, value in zip(names, place.values(), strict=True)
-        )
-        found[words] = one.identification()
-    return make_schedule([one.model for one in found.values()], names), found
-
-
-class _Tests:
-    """The tests of one working point; arguments as of `identify_fmu`."""
+class StepTests:
+    """The tests of one working point; arguments as of `identify_fmu`, and `ways`, those that are made."""
 
     def __init__(
         self, path, mvs, cvs, dt, samples, dvs=(), start=(), settle=None, time_limit=TIME_LIMIT,

@@ -51,7 +51,8 @@ def identify_fmu(options: Options) -> int:
     if len(set(cvs)) != len(cvs):
         raise InputError("--cv", list(cvs), "each CV once")
     start = {name: _value(text or "") for name, text in _named("--set", options.set or ())}
-    from identify import fmu_steps
+    from identify.fmu_steps import identify_fmu as identified
+    from identify.fmu_sweep import identify_fmu_schedule
     from jaxmpc.programs.progress import shown, watched
 
     given: dict[str, Any] = {"start": start, "settle": options.settle}
@@ -61,8 +62,8 @@ def identify_fmu(options: Options) -> int:
     wanted = (options.source, mvs, cvs, options.dt, 250 if options.samples is None else options.samples)
     try:
         with shown(), watched(lambda seconds: f"{seconds:.0f} s: {doing[0]}"):
-            swept = fmu_steps.identify_fmu_schedule(*wanted, at, **given) if at else None
-            found = fmu_steps.identify_fmu(*wanted, dvs=dvs, **given)
+            swept = identify_fmu_schedule(*wanted, at, **given) if at else None
+            found = identified(*wanted, dvs=dvs, **given)
     except InputError as error:
         field = next(
             (error.field.replace(own, to) for own, to in FIELDS.items() if error.field.startswith(own)),

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from identify.fmu import FmuPlant
-from identify.fmu_steps import identify_fmu, identify_fmu_schedule
+from identify.fmu_steps import identify_fmu
+from identify.fmu_sweep import identify_fmu_schedule
 from jaxmpc.cli.main import main
 from jaxmpc.controller.schedule import ModelSchedule
 from jaxmpc.errors import InputError, PlantError
