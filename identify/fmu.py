@@ -75,6 +75,7 @@ class FmuPlant:
         token: its GUID or instantiation token.
         fmi: its major FMI version.
         disturbance_names: variables that are disturbed.
+        substep: step of the FMU [s].
         working_point: ``"mv"`` [MV unit].
 
     Raises:
@@ -120,8 +121,8 @@ class FmuPlant:
         try:
             self.token, self.fmi = self.description.token, self.description.fmi
             self._check_description()
-            self._substep, self._count = self.description.step_of(self.dt, substep)
-            self._settle = math.ceil(settle / self._substep - 1e-9)
+            self.substep, self._count = self.description.step_of(self.dt, substep)
+            self._settle = math.ceil(settle / self.substep - 1e-9)
             self._variables = dict(variables or {})
             self._take_start(start or {})
             self._take_mvs(mv, working_point or {}, positions or {})
@@ -215,11 +216,11 @@ class FmuPlant:
         """Begin a new run with the MVs at their working point, let it settle, and measure."""
         self._begin(self.working_point, 0.0)
         if self._settle:
-            self._fmu.step(self._substep, count=self._settle)
+            self._fmu.step(self.substep, count=self._settle)
         return self.measure()
 
     def _begin(self, mv: Any, disturbance: Any, values: Mapping[str, Value] | None = None) -> None:
-        """Begin a new run at time zero with these MVs and disturbances held, and more start values."""
+        """Begin a new run with these MVs and disturbances held, and more start values."""
         if self._process is None:
             self._process = FmuProcess(self.path, self.time_limit)
         self._position, self._begun = np.array(mv, dtype=np.float64), True
@@ -240,12 +241,12 @@ class FmuPlant:
         """
         fmu = self._fmu
         inputs = self._demanded(mv, disturbance)
-        return self._measured(fmu.step(self._substep, inputs, self._outputs, self._count))
+        return self._measured(fmu.step(self.substep, inputs, self._outputs, self._count))
 
     def hold(self, mv, samples: int) -> Float[np.ndarray, "sample cv"]:
         """As `step`, for many samples of the same demands, undisturbed, in a tenth of the time; CVs at their ends."""
         fmu = self._fmu
-        rows = fmu.hold(self._substep, self._demanded(mv, 0.0), self._outputs, self._count, samples)
+        rows = fmu.hold(self.substep, self._demanded(mv, 0.0), self._outputs, self._count, samples)
         bad = next((row for row in rows if not np.isfinite(np.array(row, dtype=np.float64)).all()), [])
         self._numbers(bad)
         return np.array(rows, dtype=np.float64)[:, : len(self.cv_names)]
@@ -344,7 +345,7 @@ class FmuPlant:
         how = (
             (self.mv_names, self._actuators, self.working_point.tolist(), self._positions),
             (self.cv_names, self.disturbance_names, self._undisturbed.tolist(), self._variables),
-            (sorted(self._start_values.items()), self._substep, self._count, self._settle, self._stop),
+            (sorted(self._start_values.items()), self.substep, self._count, self._settle, self._stop),
         )
         digest = hashlib.sha256(self.path.read_bytes() + repr(how).encode())
         return {"kind": "fmu", "hash": digest.hexdigest()[:32], "fmi": self.fmi}

@@ -20,6 +20,8 @@ Value = float | int | bool | str
 
 REALS = ("Real", "Float32", "Float64")
 BITS = {"Integer": 32} | {f"{sign}Int{bits}": bits for sign in ("", "U") for bits in (8, 16, 32, 64)}
+TOLD = 5  # flaws that are listed
+MOST_STEPS = 1000  # in a sampling interval, if nobody asks for more
 NUMBERS = (*REALS, *BITS, "Boolean", "Enumeration")  # types that a number can stand for
 
 
@@ -141,6 +143,7 @@ class FmuDescription:
         experiment: default ``start``, ``stop`` and ``step`` [s], and ``tolerance``.
         variable_steps: whether its communication steps may differ in size.
         fixed_step: its own step, of which a communication step is a multiple [s].
+        flaws: in what it breaks the standard, without harm.
     """
 
     fmi: int
@@ -155,11 +158,12 @@ class FmuDescription:
     experiment: dict[str, float | None]
     variable_steps: bool
     fixed_step: float | None
+    flaws: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, facts: dict[str, Any]) -> FmuDescription:
         """From what `identify.fmu_worker` sends."""
-        own: dict[str, Any] = {name: tuple(facts[name]) for name in ("kinds", "platforms")}
+        own: dict[str, Any] = {name: tuple(facts[name]) for name in ("kinds", "platforms", "flaws")}
         own["variables"] = {
             v["name"]: FmuVariable(**(v | {"shape": tuple(v["shape"])})) for v in facts["variables"]
         }
@@ -202,7 +206,8 @@ class FmuDescription:
         """The communication step [s] and how many of them make a sampling interval `dt` [s].
 
         It is `substep`; without, that of the default experiment or the FMU's own, or the next smaller one if it may vary. An
-        FMU for model exchange has none: it is integrated from sample to sample.
+        FMU for model exchange has none: it is integrated from sample to sample. Of its own steps, several are one where more
+        than 1000 would make a sampling interval.
 
         Raises:
             InputError: where that is no whole number.
@@ -213,6 +218,8 @@ class FmuDescription:
         for step in steps:
             count = max(round(dt / step), 1)
             if abs(dt - count * step) <= 1e-9 * dt:
+                several = 1 if substep else -(-count // MOST_STEPS)
+                count //= next(many for many in range(several, count + 1) if count % many == 0)
                 return dt / count, count
         step = steps[0]
         if substep is not None:
@@ -220,7 +227,7 @@ class FmuDescription:
         if not self.variable_steps:
             expected = f"a whole number of steps of {step:g} s, the only ones that the FMU makes"
             raise InputError("plant.dt", dt, expected)
-        count = math.ceil(dt / step)
+        count = min(math.ceil(dt / step), MOST_STEPS)
         return dt / count, count
 
     def table(self) -> str:
@@ -239,6 +246,8 @@ class FmuDescription:
             ),
             "steps": ("of any size" if self.variable_steps else "all of one size") + own,
             "variables": str(len(self.variables)),
+            "flaws": " ".join(self.flaws[:TOLD])
+            + (f" And {more} more" if (more := len(self.flaws) - TOLD) > 0 else ""),
         }
         if "CoSimulation" not in self.kinds:
             del facts["steps"]

@@ -11,13 +11,22 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from fmpy.sundials import NV_DATA_S, CVodeSolver, SUNContext_PushErrHandler
+from fmpy.sundials import (
+    NV_DATA_S,
+    CVodeReInit,
+    CVodeSetMaxNumSteps,
+    CVodeSolver,
+    CVodeSVtolerances,
+    SUNContext_PushErrHandler,
+)
 from fmpy.sundials.libraries import sundials_core
 
 TOLERANCE = 1e-9  # relative; small steps of an input change large states by little
-ABSOLUTE = 1e-12  # of the nominal value, which is 1 in most FMUs, also of states that are small
+ABSOLUTE = 1e-12  # of the size of a state: its nominal value, or what it has reached if that is less
 MAX_STEPS = 1_000_000  # of the solver between two points; the time limit of a call ends it before
-CLOSE = 1e-10  # of a time: two times that are one
+FEW_STEPS = 20_000  # likewise, while tolerances follow small states: some of them may be rounding
+RESIZED = 10.0  # factor of a tolerance from which on another is worth it to begin anew
+CLOSE, ROUNDING = 1e-9, 1e-14  # of the largest step, of a time: two times that are one
 
 
 class _Solver(CVodeSolver):
@@ -27,8 +36,32 @@ class _Solver(CVodeSolver):
 
     def __init__(self, **options: Any):
         super().__init__(**options)
+        self.absolute = self.npabstol.copy()  # of nominal values
         sundials_core.SUNContext_ClearErrHandlers(self.sunctx)  # what it prints is in the error, too
         SUNContext_PushErrHandler(self.sunctx, self.ehfun_, None)
+
+    def states(self, get: Callable[..., Any] | None = None) -> np.ndarray:
+        """The states that the FMU has now, or their derivatives by its function for them; a view that ends with the next."""
+        if not self.discrete:
+            (get or self.get_x)(self.px, self.nx)
+        return np.ctypeslib.as_array(self.px, (self.nx,))
+
+    def tolerate(self, time: float, sizes: np.ndarray | None) -> None:
+        """Begin anew with tolerances for states of these sizes, if they need others; without, by their nominal values."""
+        absolute = self.absolute.copy()
+        if sizes is not None:
+            absolute = np.where(sizes > 0, np.minimum(ABSOLUTE * sizes, absolute), absolute)
+            if (np.abs(np.log(absolute / self.npabstol)) < math.log(RESIZED)).all():
+                return
+        self.npabstol[:] = absolute
+        CVodeSVtolerances(self.cvode_mem, TOLERANCE, self.abstol)
+        CVodeSetMaxNumSteps(self.cvode_mem, MAX_STEPS if sizes is None else FEW_STEPS)
+        CVodeReInit(self.cvode_mem, time, self.x)
+
+    def reset(self, time: float) -> None:
+        """Begin anew from the states that the FMU has now, with the same tolerances."""
+        self.states()
+        CVodeReInit(self.cvode_mem, time, self.x)
 
     def f(self, t: float, y: Any, ydot: Any, user_data: Any) -> int:
         """Derivatives; asks for a smaller step where they are no numbers."""
@@ -67,12 +100,16 @@ class Exchange:
     Args:
         fmu: of FMPy, which has left its initialisation mode.
         described: FMPy's reading of its description.
+        begin: time at which it begins [s].
     """
 
-    def __init__(self, fmu: Any, described: Any):
+    def __init__(self, fmu: Any, described: Any, begin: float = 0.0):
         self._fmu, self._described = fmu, described
         self._fmi3 = described.fmiVersion.startswith("3")
-        self._time, self._next_event = 0.0, math.inf
+        self._time, self._next_event = begin, math.inf
+        self._sizes: np.ndarray | None = np.zeros(
+            0
+        )  # of the states; None where tolerances do not follow them
         self._solver: _Solver | None = None
         self._update()
 
@@ -86,7 +123,8 @@ class Exchange:
         """Go to a time [s] in solver steps of at most `largest` [s]."""
         if self._solver is None:
             self._solver = self._new_solver(largest)
-        close = CLOSE * max(1.0, end)
+        self._follow_sizes(self._solver, largest)
+        close = self._close = CLOSE * largest + ROUNDING * abs(end)
         while True:
             if self._next_event <= self._time + close:
                 self._event(max(self._next_event, self._time))
@@ -105,15 +143,38 @@ class Exchange:
 
     def _integrate(self, solver: _Solver, aim: float) -> bool:
         """Up to a time or the next state event; returns whether it is one."""
+        before = solver.states().copy()
         try:
             crossed, _, reached = solver.step(self._time, aim)
         except Exception as error:
+            if self._sizes is not None and solver.failure is None:
+                self._sizes = (
+                    None  # some small state was rounding: from here again, as its nominal value says
+                )
+                solver.states()[:] = before
+                solver.set_x(solver.px, solver.nx)
+                self._fmu.setTime(self._time)
+                solver.tolerate(self._time, None)
+                return self._integrate(solver, aim)
             if solver.failure is not None:
                 raise solver.failure from None
             raise RuntimeError(f"CVode cannot integrate it after t = {self._time:.10g} s ({error})") from None
-        self._time = aim if abs(reached - aim) <= CLOSE * max(1.0, aim) else reached
+        self._time = aim if abs(reached - aim) <= self._close else reached
         self._fmu.setTime(self._time)
         return crossed
+
+    def _follow_sizes(self, solver: _Solver, largest: float) -> None:
+        """Tolerances for states that are far smaller than the nominal value that they declare, or do not declare."""
+        if self._sizes is None or solver.discrete:
+            return
+        x = np.abs(solver.states())
+        self._sizes = np.maximum(self._sizes, x) if len(self._sizes) else x
+        resting = self._sizes == 0.0
+        if resting.any():  # how far they will go
+            rates = np.abs(solver.states(solver.get_dx))
+            self._sizes[resting] = np.nan_to_num(rates[resting] * largest, posinf=0.0)
+            solver.states()
+        solver.tolerate(self._time, self._sizes)
 
     def _event(self, time: float) -> None:
         self._time = time

@@ -160,6 +160,16 @@ def repeats(one: Moved, total: Mapping[str, Any], base: Any, noise: Any, samples
     return int(min(math.ceil(need), MOST_REPEATS, max(MOST_SAMPLES / cost, 2)))
 
 
+def scatter(runs: Mapping[str, Any]) -> Any:
+    """Standard deviation of the noise, by CV, where runs ``"run sample cv"`` of a test differ most in time."""
+    found = []
+    for own in (own for own in runs.values() if len(own) > 3):
+        wide = max(own.shape[1] // 4, 1)
+        means = np.add.reduceat(own.var(axis=0, ddof=1), np.arange(0, own.shape[1] - wide + 1, wide)) / wide
+        found.append(np.sqrt(means[:-1] if len(means) > 1 else means).max(axis=0))
+    return np.max(found, axis=0) if found else 0.0
+
+
 def actuator_of(v: FmuVariable) -> dict[str, Any] | None:
     """How an MV of this type moves, in the words of a process file."""
     if v.type == "Boolean":

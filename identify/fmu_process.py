@@ -101,12 +101,12 @@ class FmuProcess:
         inputs: Mapping[str, Value] | None = None,
         stop: float | None = None,
     ) -> None:
-        """Begin a new run at time zero, with start values by name.
+        """Begin a new run at time zero, or where its default experiment begins, with start values by name.
 
         Args:
             values: set before the FMU initialises itself.
             inputs: set while it does, and held from then on.
-            stop: time that the FMU is told the run will end [s]; by default it is told none.
+            stop: after which time the FMU is told the run will end [s]; by default it is told none.
         """
         self.load()
         self._ask(start=[dict(values or {}), dict(inputs or {}), stop])

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -19,15 +18,14 @@ import numpy as np
 from jaxtyping import Float
 
 from identify.fmu import FmuPlant, fmu_digest
-from identify.fmu_description import BITS, REALS, FmuDescription, Value
-from identify.fmu_inputs import WAYS, Moved, actuator_of, error_of, further, moved, repeats
+from identify.fmu_description import BITS, REALS, TOLD, FmuDescription, Value
+from identify.fmu_inputs import WAYS, Moved, actuator_of, error_of, further, moved, repeats, scatter
 from identify.fmu_process import TIME_LIMIT, FmuProcess
-from identify.fmu_verdicts import NOTHING, Tests, advice_of, judged, movement_of
+from identify.fmu_verdicts import NOTHING, Tests, advice_of, back_share, grid_of, judged, movement_of
 from identify.names import legal_names
 from identify.step_test import SETTLE_SAMPLES
 from jaxmpc.check import is_count, is_number
-from jaxmpc.controller.schedule import ModelSchedule, make_schedule
-from jaxmpc.errors import InputError, PlantError, near
+from jaxmpc.errors import InputError, PlantError
 from jaxmpc.model.identification import Identification, Record
 from jaxmpc.model.step_response import StepResponseModel, make_model
 
@@ -76,50 +74,12 @@ def identify_fmu(
         InputError: for a file, variable, value or step that cannot be, before anything is simulated.
         PlantError: if the FMU fails.
     """
-    tests = _Tests(path, mvs, cvs, dt, samples, dvs or {}, start or {}, settle, time_limit, told)
+    tests = StepTests(path, mvs, cvs, dt, samples, dvs or {}, start or {}, settle, time_limit, told)
     return tests.identification()
 
 
-def identify_fmu_schedule(
-    path: str | Path,
-    mvs: Mapping[str, tuple[Value | None, float | None]],
-    cvs: Sequence[str],
-    dt: float,
-    samples: int,
-    at: Mapping[str, Sequence[Value]],
-    *,
-    told: Told | None = None,
-    **more,
-) -> ModelSchedule:
-    """A gain schedule: models as of `identify_fmu` over a grid of one or two of the MVs, from steps up and down.
-
-    Raises:
-        InputError: as `identify_fmu`, and for a grid that is none.
-    """
-    if len(at) not in (1, 2):
-        raise InputError("--at", list(at), f"values of one or two of the MVs {', '.join(mvs)}")
-    for mv, values in at.items():
-        if mv not in mvs:
-            raise InputError("--at", mv, f"one of the MVs {', '.join(mvs)}", near(mv, mvs))
-        if len(values) < 2 or len(set(values)) != len(values):
-            raise InputError(f"--at {mv}", list(values), "two or more distinct values")
-    places = [dict(zip(at, values, strict=True)) for values in itertools.product(*at.values())]
-
-    def tests(place: Mapping[str, Value]) -> _Tests:
-        there = {mv: (place.get(mv, value), step) for mv, (value, step) in mvs.items()}
-        return _Tests(path, there, cvs, dt, samples, told=told, ways=("up", "down"), **more)
-
-    prepared = [tests(place) for place in places]  # all are checked before any is simulated
-    names = [one.channel for one in prepared[0].inputs if one.variable.name in at]
-    models = []
-    for number, one in enumerate(prepared, 1):
-        one.tell(f"working point {number} of {len(places)}")
-        models.append(one.identification().model)
-    return make_schedule(models, names)
-
-
-class _Tests:
-    """The tests of one working point; arguments as of `identify_fmu`."""
+class StepTests:
+    """The tests of one working point; arguments as of `identify_fmu`, and `ways`, those that are made."""
 
     def __init__(
         self, path, mvs, cvs, dt, samples, dvs=(), start=(), settle=None, time_limit=TIME_LIMIT,
@@ -144,6 +104,11 @@ class _Tests:
             raise InputError("--dv", min(twice), "a variable that is no MV")
         with FmuProcess(path, time_limit) as fmu:
             self.description: FmuDescription = fmu.description
+        if self.description.flaws:
+            flaws = " ".join(self.description.flaws[:TOLD])
+            self.notes.append(
+                f"the description of the FMU breaks its standard, which does no harm here: {flaws}"
+            )
         channels = legal_names((*given, *cvs))
         self.renamed = {c: name for name, c in channels.items() if c != name}
         self.inputs: list[Moved] = []
@@ -165,7 +130,7 @@ class _Tests:
             start=self.start,
             working_point={one.channel: one.variable.nearest(one.rest) for one in self.inputs},
             settle=settle,
-            stop_time=(settle + LONGEST * self.block * dt) + (samples + 1) * dt,
+            stop_time=(settle + LONGEST * self.block * dt) + (2 * samples + 1) * dt,
             time_limit=time_limit,
             description=self.description,
         )
@@ -174,7 +139,12 @@ class _Tests:
             False,
             np.full(len(cvs), np.nan),
         )  # new processes for runs; CVs that all begin with
-        self.plant_of(0.0)  # checked before anything is simulated
+        substep = self.plant_of(0.0).substep  # checked before anything is simulated
+        own = self.description.experiment["step"]
+        if own and "CoSimulation" in self.description.kinds and substep > 1.5 * own:
+            self.notes.append(
+                f"its default experiment has steps of {own:g} s, far more than 1000 in {dt:g} s: they are of {substep:g} s"
+            )
 
     def tell(self, what: str) -> None:
         """Say what is being done."""
@@ -225,8 +195,10 @@ class _Tests:
             )
         return (len(record) - 1) * self.dt
 
-    def _runs(self, plant: FmuPlant, mv: np.ndarray, count: int) -> Float[np.ndarray, "run sample cv"]:
-        """CVs of runs with held MVs from the working point on, the first sample before they act."""
+    def _runs(
+        self, plant: FmuPlant, mv: np.ndarray, count: int, back: bool = False
+    ) -> Float[np.ndarray, "run sample cv"]:
+        """CVs of runs with held MVs from the working point on, the first before they act, and as long `back` there."""
         runs = []
         for _ in range(count):
             if self.anew:
@@ -239,24 +211,29 @@ class _Tests:
                 )
                 plant.close()
                 begin = plant.init().cv
-            runs.append(np.vstack([begin, plant.hold(mv, self.samples)]))
+            held = [mv, self.rest] if back else [mv]
+            runs.append(np.vstack([begin, *(plant.hold(one, self.samples) for one in held)]))
         return np.array(runs)
 
     def _identified(self, plant: FmuPlant, settle: float) -> Identification:
         self.tell("runs without steps")
-        still = self._runs(plant, self.rest, 2)
+        longer = self._there_and_back(plant, self.rest)
+        still = np.concatenate([longer[None, : self.samples + 1], self._runs(plant, self.rest, 1)])
         scale = np.abs(still).max(axis=(0, 1))
         apart = np.abs(still[0] - still[1]).max(axis=0)
         noise = np.where(apart > REPEATED * scale, (still[0] - still[1]).std(axis=0) / math.sqrt(2), 0.0)
         self.begin = np.where(noise == 0, still[0, 0], np.nan)
         shape = (len(self.cvs), len(self.inputs), self.samples)
         responses = {way: np.full(shape, np.nan) for way in self.ways}
-        errors, changes = np.zeros(shape[:2]), np.zeros(shape[:2])
+        errors, changes, left = (np.zeros(shape[:2]) for _ in range(3))
         means: dict[tuple[int, str], np.ndarray] = {}
         most = 2
         for j, one in enumerate(self.inputs):
             self.tell(f"steps of {one.channel}, input {j + 1} of {len(self.inputs)}")
-            counts = self._tested(plant, j, one, still.mean(axis=0), noise, settle, means)
+            way, back = self._back(plant, j, one, longer)
+            left[:, j] = back_share(back, noise)
+            first = {way: back[: self.samples + 1] + longer[: self.samples + 1]}
+            counts, noise = self._tested(plant, j, one, still.mean(axis=0), noise, settle, means, first)
             most = max(most, counts)
             errors[:, j] = noise / math.sqrt(counts) * error_of(one)
         if noise.any() and most > 2:
@@ -277,7 +254,9 @@ class _Tests:
         scale = np.maximum(scale, changes.max(axis=1))
         more = self._further(settle, (changes <= NOTHING * scale[:, None]) & (noise == 0)[:, None], base)
         whole = [v.type in REALS for v in self.cv_variables]
-        seen = Tests(model, responses, errors, changes, scale, more, base, whole)
+        levels = np.stack([base, *means.values()])
+        grid = np.array([0.0 if noise[i] else grid_of(levels[:, :, i]) for i in range(len(self.cvs))])
+        seen = Tests(model, responses, errors, changes, scale, more, base, whole, left, grid)
         verdicts, notes = judged(seen)
         notes = (*self.notes, *self._noise_notes(noise, most), *notes)
         silent = np.array([row.verdict == "none" for row in verdicts]).reshape(mean.shape[:2])
@@ -295,21 +274,40 @@ class _Tests:
             records=self._records(means, base, mean),
         )
 
-    def _tested(self, plant, j, one, base, noise, settle, means) -> int:
-        """Make the tests of an input; returns how many runs each mean is of."""
-        total, count = {}, 1
+    def _back(self, plant, j, one: Moved, longer: np.ndarray) -> tuple[str, Float[np.ndarray, "sample cv"]]:
+        """The smallest test of an input and its way back: by how much the CVs differ from those without it."""
+        way = min(one.targets, key=lambda way: (abs(one.targets[way] - one.rest), list(WAYS).index(way)))
+        return way, self._there_and_back(plant, self._stepped(j, one.targets[way])) - longer
+
+    def _there_and_back(self, plant: FmuPlant, mv: np.ndarray) -> Float[np.ndarray, "sample cv"]:
+        """CVs of a run with held MVs and as long without; NaN where an FMU does not go that far."""
+        try:
+            return self._runs(plant, mv, 1, back=True)[0]
+        except PlantError:
+            plant.close()
+            run = self._runs(plant, mv, 1)[0]
+            return np.pad(run, ((0, self.samples), (0, 0)), constant_values=np.nan)
+
+    def _tested(self, plant, j, one, base, noise, settle, means, first) -> tuple[int, np.ndarray]:
+        """Make the tests of an input; returns how many runs each mean is of, and the noise as the runs show it."""
+        runs, count = {}, 1
         for way, target in one.targets.items():
-            total[way] = self._runs(plant, self._stepped(j, target), 1)[0]
-        if noise.any():
-            count = repeats(one, total, base, noise, self.samples, settle / self.dt)
+            given = way in first
+            runs[way] = first[way][None] if given else self._runs(plant, self._stepped(j, target), 1)
+        for _ in range(3 if noise.any() else 0):
+            total = {way: own.mean(axis=0) for way, own in runs.items()}
+            need = repeats(one, total, base, noise, self.samples, settle / self.dt)
+            if need <= 1.1 * count:
+                break
+            count = need
             for way, target in one.targets.items():
-                more = count - 1 if "half" not in way else max(count // 4, 1) - 1
-                if more:
+                more = (count if "half" not in way else max(count // 4, 1)) - len(runs[way])
+                if more > 0:
                     self.tell(f"{one.channel} {way}: {more} more runs, to average the noise")
-                    again = self._runs(plant, self._stepped(j, target), more)
-                    total[way] = (total[way] + again.sum(axis=0)) / (more + 1)
-        means.update({(j, way): run for way, run in total.items()})
-        return count
+                    runs[way] = np.concatenate([runs[way], self._runs(plant, self._stepped(j, target), more)])
+            noise = np.where(noise > 0, np.maximum(noise, scatter(runs)), 0.0)
+        means.update({(j, way): own.mean(axis=0) for way, own in runs.items()})
+        return count, noise
 
     def _further(self, settle: float, silent: np.ndarray, base: np.ndarray) -> Float[np.ndarray, "cv input"]:
         """Largest change of CVs that an input has not moved, after a much larger step of it; 0 where there is none."""

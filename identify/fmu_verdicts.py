@@ -23,8 +23,12 @@ CURVED, BENT = (
     0.05,
     0.5,
 )  # of a response: differences of its tests from which on to look, and not to use the mean
+GROWN = 1.05  # of a swing: from one third of a response to the next
 CONSTANT = 0.02  # of a slope: two that are one
-LEFT = 0.003  # of a response: 95 % error of a coefficient by noise from which on to look
+LEFT = 0.005  # of a response: error of its worst coefficient by noise, or by whole steps of a CV, from which on to look
+COARSE = 0.03  # likewise by whole steps, from which on not to use it
+HANGING, STUCK = 0.01, 0.2  # of a response: what stays after the way back, to look at and not to use
+UNLIKE = 0.005  # of a response: differences of tests that are told
 FAST = 3  # samples to 63 % of a gain
 
 
@@ -40,6 +44,8 @@ class Tests(NamedTuple):
         further: largest change after a much larger step, where the tests have changed nothing; 0 elsewhere [CV unit].
         base: without steps.
         continuous: whether a CV takes every value.
+        left: what stays of a response that had settled after its input has gone back, as a share.
+        grid: steps in which a CV moves; 0 where it has none, or noise [CV unit].
     """
 
     model: StepResponseModel
@@ -50,6 +56,8 @@ class Tests(NamedTuple):
     further: Float[np.ndarray, "cv input"]
     base: Float[np.ndarray, "sample cv"]
     continuous: Sequence[bool]
+    left: Float[np.ndarray, "cv input"]
+    grid: Float[np.ndarray, " cv"]
 
 
 def judged(tests: Tests) -> tuple[tuple[PairVerdict, ...], list[str]]:
@@ -115,24 +123,35 @@ def _pair(tests: Tests, i: int, j: int, row: Settling) -> tuple[Verdict, str]:
         looks.append(
             f"it moves by {part:.1g} of its value only, which tolerances of a solver may blur: step further"
         )
-    share = 1.96 * error / peak
+    share = expected_peak / peak
     if share > LEFT:
         looks.append(f"noise leaves +-{100 * share:.2g} % of its largest value: larger steps leave less")
+    coarse, says = _coarse(tests, i, j, cv_unit)
+    looks += [says] if says else []
+    stays = tests.left[i, j] if row.settled and not coarse else 0.0
+    if stays > HANGING:
+        looks.append(
+            f"{100 * stays:.2g} % of it stays when {row.mv} has gone back: backlash or hysteresis within the step, "
+            "or a part that is slower than the model; step further"
+        )
     if not tests.continuous[i]:
         looks.append(
             f"{row.cv} takes whole values only: this is its answer to steps of this size and to no other"
         )
-    alone = _drift(tests.base[:, i])
+    movement, doubt = (float(found[i]) for found in movement_of(tests.base))
+    alone = max(2 * (movement - 8 * doubt), 0.0)
     if alone > CURVED * tests.changes[i, j]:
         looks.append(
             f"without a step it moves by {amount(alone, cv_unit)} in the same time: the response is the difference of both, "
             "which is right where the plant is linear; let it settle longer (--settle), or look at what drives it"
         )
-    verdict: Verdict = "bad" if runaway else "look" if looks else "good"
     apart, says = _sizes(tests, i, j, peak, error)
     if apart > CURVED:
         looks.append(says)
-        verdict = "bad" if apart > BENT or runaway else "look"
+    elif apart > UNLIKE and not faint:
+        words += f" ({says.partition(';')[0]})"
+    unusable = runaway or apart > BENT or coarse > COARSE or stays > STUCK
+    verdict: Verdict = "bad" if unusable else "look" if looks else "good"
     if not looks and row.settled and _rise(s, row.gain) < FAST:
         words += "; it is there within 3 samples: what it does in between is not seen"
     return verdict, "; ".join([words, *looks])
@@ -145,6 +164,38 @@ def _apart(tests: Tests, i: int, j: int) -> float:
     if not peak or all("half" not in way for way in tested):
         return math.inf
     return float(np.ptp(np.stack(list(tested.values())), axis=0).max() / peak)
+
+
+def _coarse(tests: Tests, i: int, j: int, unit: str) -> tuple[float, str]:
+    """Error of a coefficient by the steps in which a CV moves, as a share of the response, and words for it."""
+    both = all(np.isfinite(tests.responses[way][i, j]).all() for way in ("up", "down"))
+    share = float(tests.grid[i] / tests.changes[i, j]) / (2 if both else 1)
+    # where tests of all sizes agree, the steps are those of the tests: a valve that opens at once
+    if share <= LEFT or _apart(tests, i, j) < 0.1 * share:
+        return 0.0, ""
+    return share, (
+        f"{tests.model.cv_names[i]} moves in steps of {amount(tests.grid[i], unit)}, which leaves +-{100 * share:.2g} % of "
+        "the response: step further (--mv NAME=VALUE:STEP)"
+    )
+
+
+def grid_of(values: np.ndarray) -> float:
+    """The step of which all differences of some values are multiples; 0 if there is none."""
+    gaps = np.diff(np.unique(values))
+    if not gaps.size:
+        return 0.0
+    multiples = gaps / gaps.min()
+    return float(gaps.min()) if (np.abs(multiples - np.rint(multiples)) < 1e-3).all() else 0.0
+
+
+def back_share(change: Float[np.ndarray, "sample cv"], noise: Float[np.ndarray, " cv"]) -> np.ndarray:
+    """What stays of the changes by a step at the end of as long a way back, beyond what noise and a settled rest explain."""
+    count = len(change) // 2 + 1
+    tenth = max(count // 10, 1)
+    there, back = change[:count], change[-tenth:].mean(axis=0)
+    moving = np.abs(there[-tenth:].mean(axis=0) - there[-2 * tenth : -tenth].mean(axis=0))
+    beyond = np.abs(back) - 3 * moving - 6 * noise / math.sqrt(tenth)
+    return np.maximum(np.nan_to_num(beyond), 0.0) / np.maximum(np.abs(there).max(axis=0), 1e-300)
 
 
 def _stands_out(s: np.ndarray, error: float, expected: float) -> bool:
@@ -161,17 +212,12 @@ def movement_of(cv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return movement, noise * 2 / math.sqrt(len(cv)) / 2
 
 
-def _drift(base: np.ndarray) -> float:
-    """By how much a CV moves without a step, beyond noise."""
-    half = len(base) // 2
-    noise = np.diff(base, n=2).std() / math.sqrt(6 * half) if half > 1 else 0.0
-    return max(abs(base[-half:].mean() - base[:half].mean()) * 2 - 12 * noise, 0.0)
-
-
 def _moving(s: np.ndarray, row: Settling, dt: float, per: str, error: float) -> tuple[bool, str]:
     """Whether a response runs away, and what is to be said of one that still moves at its end."""
     if row.settled or len(s) < 8:
         return False, "" if row.settled else f"not settled by sample {len(s)}: give more samples"
+    if not error and (swings := _swinging(s)):
+        return swings
     quarter = len(s) // 4
     ends = [len(s) - k * quarter for k in (2, 1, 0)]
     slopes = [np.polyfit(np.arange(quarter) * dt, s[end - quarter : end], 1)[0] for end in ends]
@@ -194,6 +240,27 @@ def _moving(s: np.ndarray, row: Settling, dt: float, per: str, error: float) -> 
     left = -math.log(0.01) * quarter / max(math.log(max(abs(before), 1e-300) / max(abs(last), 1e-300)), 1e-3)
     more = f"; about {math.ceil(left / 50) * 50:d} samples would show it all" if 0 < left < 1e5 else ""
     return False, f"not settled by sample {len(s)}: it still moves {last:.3g}{per} each second{more}"
+
+
+def _swinging(s: np.ndarray) -> tuple[bool, str] | None:
+    """The same of a response that swings up to its end; None of one that does not."""
+    third = len(s) // 3
+    before, last = s[third : 2 * third], s[-third:]
+    if min(np.count_nonzero(np.diff(np.sign(np.diff(part)))) for part in (before, last)) < 2:
+        return None
+    ratio = float(np.ptp(last) / np.ptp(before))
+    if ratio > GROWN:
+        return (
+            True,
+            "it swings ever more: it is unstable, and a step response cannot model that; stabilise it first",
+        )
+    more = (
+        f"; about {math.ceil(third * math.log(0.01) / math.log(ratio) / 50) * 50:d} samples would show it all"
+    )
+    return (
+        False,
+        f"it still swings at sample {len(s)}{more if ratio < 1 / GROWN else ', and hardly less and less'}",
+    )
 
 
 def _sizes(tests: Tests, i: int, j: int, peak: float, error: float) -> tuple[float, str]:
@@ -243,8 +310,9 @@ def advice_of(verdicts: Sequence[PairVerdict], model: StepResponseModel) -> tupl
         found.append(
             f"Give more samples than {model.samples} (--samples), or a longer sampling interval (--dt)."
         )
-    if "noise leaves" in says:
-        found.append("Give larger steps (--mv NAME=VALUE:STEP), which the noise hides less.")
+    hidden = {"noise leaves": "noise", "moves in steps of": "the steps of a CV", "has gone back": "backlash"}
+    if by := [what for words, what in hidden.items() if words in says]:
+        found.append(f"Give larger steps (--mv NAME=VALUE:STEP), which {' and '.join(by)} hide less.")
     if "it integrates" in says:
         found.append("Leave out CVs that integrate, or control them with a horizon that the model covers.")
     return tuple(found)

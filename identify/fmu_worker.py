@@ -12,11 +12,9 @@ import json
 import math
 import mmap
 import os
-import re
 import shutil
 import signal
 import socket
-import stat
 import sys
 import threading
 import time
@@ -24,160 +22,20 @@ import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
-# What an archive may hold; far more than FMUs have, far less than fills a disk.
-MAX_FILES = 10_000
-MAX_BYTES = 2 * 2**30
-MAX_RATIO = 200  # unpacked to packed size: XML packs 20 : 1, a bomb 1000 : 1
-MAX_DESCRIPTION_BYTES = 256 * 2**20
+from identify.fmu_file import (
+    RefusedError,
+    check_archive,
+    facts_of,
+    kinds_of,
+    library_of,
+    number,
+    read_description,
+    unpack,
+)
 
 NOTE, NOTE_BYTES = "note", 128
 UNPACKED = "fmu"
-DESCRIPTION = "modelDescription.xml"
-
-
-class RefusedError(Exception):
-    """The file is not an FMU that can be used: what was expected, and a hint."""
-
-    def __init__(self, expected: str, hint: str = ""):
-        super().__init__(expected)
-        self.expected, self.hint = expected, hint
-
-
-def check_archive(path: Path, free: int) -> None:
-    """Refuse an archive that would leave its folder or fill the `free` bytes of the disk, from its table of contents.
-
-    Unpacking stops at the sizes in the table, so that a table that lies does no harm.
-    """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            entries = archive.infolist()
-    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile) as error:
-        raise RefusedError(f"a readable FMU, which is a zip archive ({error})") from None
-    if len(entries) > MAX_FILES:
-        raise RefusedError(f"an archive of at most {MAX_FILES} files (it has {len(entries)})")
-    for entry in entries:
-        parts = entry.filename.split("/")
-        if ".." in parts or not parts[0] or re.search(r"[\\:\0]", entry.filename):
-            raise RefusedError(f"an archive whose files stay in its folder ({entry.filename!r} does not)")
-        if stat.S_ISLNK(entry.external_attr >> 16):
-            raise RefusedError(f"an archive without symbolic links ({entry.filename!r} is one)")
-    size = sum(entry.file_size for entry in entries)
-    if size > MAX_BYTES:
-        raise RefusedError(f"an archive of at most {MAX_BYTES} bytes unpacked (it has {size})")
-    if size > MAX_RATIO * path.stat().st_size:
-        raise RefusedError(f"an archive that grows at most {MAX_RATIO} times when it is unpacked")
-    if size > free:
-        raise RefusedError(f"an archive that fits on the disk ({size} bytes unpacked, {free} bytes free)")
-    sizes = {entry.filename: entry.file_size for entry in entries}
-    if DESCRIPTION not in sizes:
-        raise RefusedError(f"an FMU, with a {DESCRIPTION}")
-    if sizes[DESCRIPTION] > MAX_DESCRIPTION_BYTES:
-        raise RefusedError(f"a {DESCRIPTION} of at most {MAX_DESCRIPTION_BYTES} bytes")
-
-
-def unpack(path: Path, folder: Path, names: list[str] | None = None) -> None:
-    """Unpack a checked archive, or some of its files."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            archive.extractall(folder, names)
-    except Exception as error:  # a damaged archive: whatever zipfile and zlib raise
-        raise RefusedError(f"an undamaged FMU ({type(error).__name__}: {error})") from None
-
-
-def read_description(path: Path, folder: Path) -> Any:
-    """FMPy's reading of the model description of an FMU of FMI 2.0 or 3.0, in a checked archive; refuses others."""
-    from fmpy import read_model_description
-
-    unpack(path, folder, [DESCRIPTION])
-    try:
-        root = ElementTree.parse(folder / DESCRIPTION).getroot()
-    except ElementTree.ParseError as error:
-        raise RefusedError(f"a {DESCRIPTION} that is XML ({error})") from None
-    version = root.get("fmiVersion", "none")
-    if not re.match(r"2\.0|3\.", version):
-        raise RefusedError(f"an FMU of FMI 2.0 or 3.0 (its version is {version})")
-    try:
-        return read_model_description(folder)
-    except Exception as error:  # FMPy has no type of its own for most of what it finds
-        reason = " ".join(str(error).split())
-        raise RefusedError(f"a {DESCRIPTION} that follows the standard ({reason})") from None
-
-
-def facts_of(described: Any, names: Iterable[str]) -> dict[str, Any]:
-    """What FMPy has read and the names of the files of the archive, for `identify.fmu_description`."""
-    from fmpy import platform, platform_tuple
-
-    fmi3 = described.fmiVersion.startswith("3")
-    slave, experiment = described.coSimulation, described.defaultExperiment
-    times = {"start": "startTime", "stop": "stopTime", "step": "stepSize", "tolerance": "tolerance"}
-    libraries = [name.split("/")[1] for name in names if re.fullmatch(r"binaries/[^/]+/[^/]+", name)]
-    sources = ["sources"] if any(name.startswith("sources/") for name in names) else []
-    return {
-        "fmi": 3 if fmi3 else 2,
-        "name": described.modelName or "",
-        "text": described.description or "",
-        "tool": described.generationTool or "",
-        "token": described.guid,
-        "kinds": kinds_of(described),
-        "platforms": [*dict.fromkeys(libraries), *sources],
-        "here": platform_tuple if fmi3 else platform,
-        "variables": [_facts_of(v) for v in described.modelVariables],
-        "experiment": {name: _number(getattr(experiment, own, None)) for name, own in times.items()},
-        "variable_steps": bool(slave and slave.canHandleVariableCommunicationStepSize),
-        "fixed_step": _number(slave and slave.fixedInternalStepSize),
-    }
-
-
-def kinds_of(described: Any) -> list[str]:
-    """The kinds of an FMU."""
-    kinds = ("CoSimulation", "ModelExchange", "ScheduledExecution")
-    return [kind for kind in kinds if getattr(described, kind[0].lower() + kind[1:]) is not None]
-
-
-def _facts_of(v: Any) -> dict[str, Any]:
-    kind = v.declaredType
-    told = lambda name: getattr(v, name) or getattr(kind, name, None)  # noqa: E731
-    return {
-        "name": v.name,
-        "type": v.type,
-        "causality": v.causality,
-        "variability": v.variability,
-        "initial": v.initial,
-        "unit": told("unit"),
-        "start": v.start,
-        "low": _number(told("min")),
-        "high": _number(told("max")),
-        "items": {item.name: int(item.value) for item in getattr(kind, "items", [])},
-        "shape": v.shape or (),
-        "text": v.description or "",
-    }
-
-
-def _number(value: Any) -> float | None:
-    try:
-        return None if value is None else float(value)
-    except ValueError:  # several, of an array
-        return None
-
-
-def library_of(folder: Path, description: Any) -> Path:
-    """The library for this machine; refuses an FMU without."""
-    from fmpy import platform, platform_tuple, sharedLibraryExtension
-
-    name = (description.coSimulation or description.modelExchange).modelIdentifier
-    here = platform_tuple if description.fmiVersion.startswith("3") else platform
-    library = folder / "binaries" / here / f"{name}{sharedLibraryExtension}"
-    if library.is_file():
-        return library
-    others = sorted(other.parent.name for other in folder.glob("binaries/*/*") if other.is_file())
-    has, hint = "none", ""
-    if others:
-        has = f"one for {', '.join(dict.fromkeys(others))}"
-    elif any(folder.glob("sources/*")):
-        has, hint = "only sources", "Compile it: fmpy compile FILE.fmu"
-    raise RefusedError(f"an FMU with a library for {here} (it has {has})", hint)
 
 
 class Runner:
@@ -200,12 +58,12 @@ class Runner:
         self.path = Path(path)
         self._begin("the reading of its model description")
         check_archive(self.path, shutil.disk_usage(self.folder).free)
-        self._described = read_description(self.path, self.folder)
+        self._described, flaws = read_description(self.path, self.folder)
         self.fmi = 3 if self._described.fmiVersion.startswith("3") else 2
         self._references = {v.name: (v.type, v.valueReference) for v in self._described.modelVariables}
         self._shapes = {v.name: v.shape for v in self._described.modelVariables if v.shape}
         with zipfile.ZipFile(self.path) as archive:
-            return facts_of(self._described, archive.namelist())
+            return facts_of(self._described, flaws, archive.namelist())
 
     def load(self) -> None:
         """Unpack the FMU, load its library and instantiate it."""
@@ -257,7 +115,7 @@ class Runner:
             raise RefusedError(f"an FMU whose library lets itself be instantiated ({reason})") from None
 
     def start(self, values: dict[str, Any], inputs: dict[str, Any], stop: float | None) -> None:
-        """Begin a new run at time zero with start values, and inputs that hold from then on."""
+        """Begin a new run where its default experiment begins, or at time zero; inputs hold from then on."""
         if self._used:
             self._begin("reset")
             try:
@@ -265,21 +123,23 @@ class Runner:
             except Exception:  # many FMUs cannot: another instance begins anew, too
                 self._fmu.freeInstance()
                 self._instantiate()
-        self._time, self._used, self._stop = 0.0, True, stop
+        begin = number(getattr(self._described.defaultExperiment, "startTime", None)) or 0.0
+        stop = None if stop is None else begin + stop
+        self._time, self._used, self._stop = begin, True, stop
         self._exchange = None
         if self.fmi == 2:
             self._begin("setupExperiment")
-            self._fmu.setupExperiment(startTime=0.0, stopTime=stop)
+            self._fmu.setupExperiment(startTime=begin, stopTime=stop)
         self.set(values)
         self._begin("its initialisation")
-        self._fmu.enterInitializationMode(**({"startTime": 0.0, "stopTime": stop} if self.fmi == 3 else {}))
+        self._fmu.enterInitializationMode(**({"startTime": begin, "stopTime": stop} if self.fmi == 3 else {}))
         self.set(inputs)
         self._begin("its initialisation")
         self._fmu.exitInitializationMode()
         if self._described.coSimulation is None:
             from identify.fmu_exchange import Exchange
 
-            self._exchange, self._held = Exchange(self._fmu, self._described), dict(inputs)
+            self._exchange, self._held = Exchange(self._fmu, self._described, begin), dict(inputs)
 
     def change(self, values: dict[str, Any]) -> None:
         """Set variables while it runs; for model exchange in an event, and only those that change."""
@@ -377,7 +237,7 @@ class Runner:
 
     def _beyond(self) -> str:
         """What may be the reason for a failed step: some FMUs end where their default experiment does, if not told when."""
-        end = _number(getattr(self._described.defaultExperiment, "stopTime", None))
+        end = number(getattr(self._described.defaultExperiment, "stopTime", None))
         late = self._stop is None and end is not None and self._time >= end * (1 - 1e-9)
         return f" (its default experiment ends at {end:g} s: give a later stop_time)" if late else ""
 

@@ -6,11 +6,10 @@ Studies, the command line and the app open theirs here.
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import importlib.util
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from jaxmpc.model.step_response import StepResponseModel, make_model
 from jaxmpc.process.actuator import Actuator
 from jaxmpc.process.file import own_module, process_digest
 from jaxmpc.process.model_plant import ModelPlant
-from jaxmpc.process.plant import Parameter, Signals, disturbances_of
+from jaxmpc.process.plant import Parameter, Signals, closing, disturbances_of
 from jaxmpc.process.process import PlantSource, Process
 
 
@@ -78,17 +77,6 @@ def parameters_of(process: Process, name: str = "") -> tuple[Parameter, ...]:
     """Parameters of a plant of a process that studies may vary."""
     with closing(open_plant(process, name)) as plant:
         return tuple(getattr(plant, "parameter_table", ()))
-
-
-@contextlib.contextmanager
-def closing(plant: Any) -> Iterator[Any]:
-    """A plant, freed at the end if it holds anything outside Python."""
-    try:
-        yield plant
-    finally:
-        close = getattr(plant, "close", None)
-        if close is not None:
-            close()
 
 
 def plant_facts(process: Process, plant: Any) -> dict[str, Any]:

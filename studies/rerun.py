@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from identify.plants import closing, disturbance_of, open_plant
+from identify.plants import disturbance_of, open_plant
 from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
 from jaxmpc.files import from_strict_json, write_atomically
 from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.trajectory import AXES, Trajectory
 from jaxmpc.model.step_response import StepResponseModel
+from jaxmpc.process.plant import closing
 from jaxmpc.process.process import Process
 from studies.definition.models import identify_models
 from studies.definition.scenarios import Scenario, Study

@@ -8,6 +8,7 @@ of co-simulation; `crossings` sets the event indicators ``z``, `update` runs in 
 import shutil
 import subprocess
 from pathlib import Path
+from xml.etree import ElementTree
 
 import fmpy
 import pytest
@@ -88,6 +89,33 @@ int fmi2NewDiscreteStates(void *c, Info *info)
 }
 int fmi2CompletedIntegratorStep(void *c, int none, int *event, int *ends) { *event = *ends = 0; return 0; }
 """
+SOURCE3 = """
+#include <stdbool.h>
+#define OF(T) \\
+    int fmi3Set##T(void *c, Refs vr, size_t n, const double *v, size_t k) { return fmi2SetReal(c, vr, n, v); } \\
+    int fmi3Get##T(void *c, Refs vr, size_t n, double *v, size_t k) { return fmi2GetReal(c, vr, n, v); }
+OF(Float64)
+void *fmi3InstantiateModelExchange(const char *name, const char *token) { return fmi2Instantiate(name, 0, token); }
+void *fmi3InstantiateCoSimulation(const char *name, const char *token) { return fmi2Instantiate(name, 1, token); }
+int fmi3Reset(void *c) { return fmi2Reset(c); }
+int fmi3ExitInitializationMode(void *c) { return fmi2ExitInitializationMode(c); }
+int fmi3SetTime(void *c, double t) { return fmi2SetTime(c, t); }
+int fmi3SetContinuousStates(void *c, const double *v, size_t k) { return fmi2SetContinuousStates(c, v, k); }
+int fmi3GetContinuousStates(void *c, double *v, size_t k) { return fmi2GetContinuousStates(c, v, k); }
+int fmi3GetNominalsOfContinuousStates(void *c, double *v, size_t k) { return fmi2GetNominalsOfContinuousStates(c, v, k); }
+int fmi3GetContinuousStateDerivatives(void *c, double *v, size_t k) { return fmi2GetDerivatives(c, v, k); }
+int fmi3GetEventIndicators(void *c, double *v, size_t k) { return fmi2GetEventIndicators(c, v, k); }
+int fmi3GetNumberOfContinuousStates(void *c, size_t *k) { *k = STATES; return 0; }
+int fmi3GetNumberOfEventIndicators(void *c, size_t *k) { *k = CROSSED; return 0; }
+int fmi3UpdateDiscreteStates(void *c, bool *again, bool *ends, bool *nominals, bool *values, bool *planned, double *when)
+{
+    Info info; fmi2NewDiscreteStates(c, &info);
+    *again = *ends = *nominals = *values = false; *planned = info.defined; *when = info.when; return 0;
+}
+int fmi3CompletedIntegratorStep(void *c, bool none, bool *event, bool *ends) { *event = *ends = false; return 0; }
+int fmi3DoStep(void *c, double t, double h, bool p, bool *event, bool *stop, bool *early, double *last)
+{ *event = *stop = *early = false; *last = t + h; return fmi2DoStep(c, t, h); }
+"""
 PLACES = ("RATE_CALL", "RATES", "RESET", "OUTPUTS", "INITIAL", "BEGIN", "TICK", "INDICATORS", "UPDATE")
 
 
@@ -116,35 +144,75 @@ def make_plant(
     step: float | None = 1.0,
     attributes: str = "",
     units: tuple[str, ...] = (),
+    starts: float = 0.0,
+    fmi: int = 2,
     **code: str,
 ) -> Path:
-    """Compile the FMU, or skip the test where there is no compiler; `code` are the snippets, by their names."""
+    """Compile the FMU, or skip the test where there is no compiler; `code` are the snippets, by their names.
+
+    Of FMI 3.0 it has real variables only.
+    """
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
         pytest.skip("no C compiler")
     from fmpy.fmi2 import FMU2Model, FMU2Slave
+    from fmpy.fmi3 import FMU3Model, FMU3Slave
 
     source = SOURCE
     for place in PLACES:
         source = source.replace(place, code.pop({"INDICATORS": "crossings"}.get(place, place.lower()), ""))
     assert not code, code
-    made = FMU2Slave if kind == "CoSimulation" else FMU2Model
-    names = [name for name in dir(made) if name.startswith("fmi2")]
+    made = (FMU2Slave, FMU2Model, FMU3Slave, FMU3Model)[2 * (fmi - 2) + (kind == "ModelExchange")]
+    names = [name for name in dir(made) if name.startswith(f"fmi{fmi}")]
+    if fmi == 3:
+        source += SOURCE3.replace("STATES", str(states)).replace("CROSSED", str(indicators))
     stubs = [n for n in names if f"{n}(" not in source and n not in ("fmi2SetInteger", "fmi2GetInteger")]
-    stubs = [n for n in stubs if n not in ("fmi2SetBoolean", "fmi2GetBoolean")]
+    macros = ("fmi2SetBoolean", "fmi2GetBoolean", "fmi3SetFloat64", "fmi3GetFloat64")
+    stubs = [n for n in stubs if n not in macros]
     source += "".join(f"int {name}(void) {{ return 0; }}\n" for name in stubs)
     library = folder / f"plant{fmpy.sharedLibraryExtension}"
     library.parent.mkdir(parents=True, exist_ok=True)
     command = [compiler, "-x", "c", "-O1", "-shared", "-fPIC", "-w", "-o", str(library), "-", "-lm"]
     subprocess.run(command, input=source, text=True, check=True)
+    described = _description(variables, kind, states, indicators, step, attributes, units, starts)
     content = {
-        "modelDescription.xml": _description(variables, kind, states, indicators, step, attributes, units),
-        f"binaries/{fmpy.platform}/{library.name}": library.read_bytes(),
+        "modelDescription.xml": described if fmi == 2 else _of_fmi3(described, kind, states),
+        f"binaries/{fmpy.platform if fmi == 2 else fmpy.platform_tuple}/{library.name}": library.read_bytes(),
     }
     return pack(folder / "plant.fmu", content)
 
 
-def _description(variables, kind, states, indicators, step, attributes, units):
+def _of_fmi3(described: str, kind: str, states: int) -> str:
+    """The same in the words of FMI 3.0."""
+    root = ElementTree.fromstring(described)
+    root.set("fmiVersion", "3.0")
+    root.set("instantiationToken", root.attrib.pop("guid"))
+    del root.attrib["numberOfEventIndicators"]
+    for gone in [*root.findall("TypeDefinitions")]:
+        root.remove(gone)
+    variables, structure = root.find("ModelVariables"), root.find("ModelStructure")
+    assert variables is not None
+    assert structure is not None
+    names = [v.get("name") for v in variables]
+    structure.clear()
+    for own in variables:
+        (of_type,) = own
+        own.tag = {"Real": "Float64"}[of_type.tag]
+        derivative = of_type.attrib.pop("derivative", None)
+        own.attrib |= of_type.attrib
+        if derivative:
+            own.set("derivative", str(variables[int(derivative) - 1].get("valueReference")))
+        own.remove(of_type)
+    time = '<Float64 name="time" valueReference="99" causality="independent" variability="continuous"/>'
+    variables.append(ElementTree.fromstring(time))
+    listed = [("Output", v) for v in variables if v.get("causality") == "output"]
+    listed += [("ContinuousStateDerivative", variables[names.index(f"der(x{k})")]) for k in range(states)]
+    for tag, v in listed:
+        ElementTree.SubElement(structure, tag, valueReference=str(v.get("valueReference")))
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _description(variables, kind, states, indicators, step, attributes, units, starts):
     lines, first = list(variables), len(variables)
     for k in range(states):
         lines.append(_variable("Real", f"x{k}", 20 + k, "local", "continuous"))
@@ -155,7 +223,11 @@ def _description(variables, kind, states, indicators, step, attributes, units):
     listed = "".join(f'<Unknown index="{i}"/>' for i in outputs)
     rates = "".join(f'<Unknown index="{first + 2 * k + 2}"/>' for k in range(states))
     rates = f"<Derivatives>{rates}</Derivatives>" if states else ""
-    experiment = f'<DefaultExperiment startTime="0" stopTime="100" stepSize="{step}"/>' if step else ""
+    experiment = (
+        f'<DefaultExperiment startTime="{starts}" stopTime="{starts + 100}" stepSize="{step}"/>'
+        if step
+        else ""
+    )
     unit = (
         f"<UnitDefinitions>{''.join(f'<Unit name={u!r}/>' for u in units)}</UnitDefinitions>" if units else ""
     )

@@ -22,7 +22,7 @@ COMPOSITION_ROOT = "jaxmpc/cli/"
 APPS = "studies/notebooks/"  # what a user opens and edits: puts studies and figures together
 DOORS = {
     "highspy": ("jaxmpc/integer/highs.py",),
-    "fmpy": ("identify/fmu.py", "identify/fmu_worker.py", "identify/fmu_exchange.py"),
+    "fmpy": tuple(f"identify/{name}.py" for name in ("fmu", "fmu_file", "fmu_worker", "fmu_exchange")),
     "pythonfmu": ("identify/controller_fmu.py", "identify/controller_slave.py"),
     "matplotlib": ("figures/",),
     "dask": ("studies/",),

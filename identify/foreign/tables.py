@@ -6,6 +6,7 @@ In TOML the list is that of a process file, ``transfer_functions``, with ``dt`` 
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -59,6 +60,11 @@ COLUMNS = {  # by their names without case, spaces, underscores and a number 1
 }
 UNUSED = {"settlingtime"}  # follows from the others
 TRUE, FALSE = {"1", "true", "yes", "x", "on"}, {"", "0", "false", "no", "off"}
+TIME_WORDS = {
+    "s": ("s", "sec", "secs", "second", "seconds"),
+    "min": ("min", "mins", "minute", "minutes"),
+    "h": ("h", "hr", "hrs", "hour", "hours"),
+}
 LEFT = 1e-3  # of the gain, which is still to come at the last coefficient
 MOST = 5000  # coefficients that are made without being asked for
 
@@ -149,6 +155,18 @@ def _read_csv(
     (where, told), units = rows[0], dict[str, str]()
     head = [_column(cell) for cell in told]
     require({"cv", "gain"} <= set(head), where, ",".join(told), "columns cv, mv and gain")
+    for cell, name in zip(told, head, strict=True):
+        found = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]", cell)
+        unit = (
+            found[1].lower().rstrip(".") if found and name in ("dead_time", "first", "second", "lead") else ""
+        )
+        agrees = unit in ("", *TIME_WORDS[asked.time_unit])
+        require(
+            agrees,
+            where,
+            cell,
+            f"times in {asked.time_unit}, or another --time-unit ({', '.join(TIME_UNITS)})",
+        )
     twice = sorted({name for name in head if name and head.count(name) > 1})
     require(not twice, where, twice, "each column once")
     sections = []

@@ -16,6 +16,10 @@ ROUNDS = 2  # of noise models estimated from residuals
 GAIN = 6.0  # by which twice a log-likelihood must improve for a model with more in it
 RAMP = 0.15  # of the mean slope of a response, which its end has at least where an integrating CV is tried
 WIDER, NARROWEST = 1.15, 0.2  # factor of all bands; least deviation over the largest of a response
+USELESS = 0.9  # of what unseen samples do: a fit that leaves as much foresees nothing
+OVERRULED = (
+    1.3  # times as much that is left of unseen samples, from which on a noise model is not the likeliest
+)
 LEAST_PRIOR = 0.3  # of the standard deviation of a CV per standard deviation of an input
 
 
@@ -120,6 +124,29 @@ def search(data: Data, length: int) -> Fit:
         if other.posterior.score < best.posterior.score - GAIN:
             best = other
     return best
+
+
+def chosen(data: Data, length: int, cut: int) -> tuple[Fit, bool]:
+    """The fit of the samples before `cut`, and whether those after it overruled the likelihood.
+
+    The likelihood judges predictions one sample ahead. Where a CV is not linear in its inputs, that may make a drifting
+    disturbance of what they do, and any response will do. It then foresees nothing of the samples after `cut` from the
+    inputs alone; a fit without drift that does is taken.
+    """
+    training = data.until(cut)
+    likely = search(training, length)
+    missed, unseen = _missed(data, likely, cut), data.output[cut:]
+    moved = float(np.nanvar(unseen)) * np.isfinite(unseen).sum() if np.isfinite(unseen).any() else 0.0
+    if likely.noise == WHITE or missed < USELESS * moved:
+        return likely, False
+    level = fitted(training, length, dataclasses.replace(likely, noise=WHITE), fresh=True)
+    overruled = OVERRULED * _missed(data, level, cut) < missed
+    return (level if overruled else likely), overruled
+
+
+def _missed(data: Data, fit: Fit, cut: int) -> float:
+    """Sum of squares of the samples from `cut` on that the inputs alone do not explain, beside one offset per segment."""
+    return float(np.nansum((data.output - simulated(data, fit, cut))[cut:] ** 2))
 
 
 def _searched(data: Data, length: int, *, integrating: bool) -> Fit:

@@ -8,14 +8,25 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
-from identify.logged.fit import Data, Fit, bands, climbing, fitted, make_data, residuals, search, simulated
+from identify.logged.fit import (
+    Data,
+    Fit,
+    bands,
+    chosen,
+    climbing,
+    fitted,
+    make_data,
+    residuals,
+    search,
+    simulated,
+)
 from identify.logged.judge import excitations, verdict_of
 from identify.logged.log import LEAST, Log, read_log
 from identify.logged.low_order import LowOrder, low_order
@@ -29,6 +40,7 @@ from jaxmpc.model.step_response import make_model
 HELD_OUT = 0.27  # share of the samples that the first fit does not see
 TRIED, COLUMNS = (32, 64, 128), 384  # lags of first fits where N is not given; most of all inputs
 ROOM = 0.7  # of the lags of a first fit, in which it settles
+COARSER = 4  # times the interval where responses do not settle within COLUMNS
 MARGIN, SHORTEST = 1.25, 10  # N over the settling time of the first fit; least N
 SETTLED, LAGS = 0.003, 5.8  # of the largest coefficient: settled; so many lags of a first order
 SPREAD = 6.9  # median deviations from 1 % to 99 % of a normal distribution
@@ -48,6 +60,7 @@ class _Cv(NamedTuple):
     band: np.ndarray
     predicted: np.ndarray  # " sample" [CV unit]
     tested: Residuals
+    overruled: bool  # whether the part that was left out has decided against the likeliest noise
 
 
 def identify_log(
@@ -59,16 +72,20 @@ def identify_log(
     dt: float | None = None,
     samples: int | None = None,
     time: str | None = None,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
     progress: bool = False,
 ) -> Identification:
     """Identify a step-response model from logged data.
 
     Args:
         path: of a CSV or Parquet file, see `read_log`.
-        mv, cv, dv: names of its columns.
+        mv, cv, dv: names, those of its columns if `columns` does not say another.
         dt: sampling interval [s]; the median of the log's own by default.
         samples: N; by default long enough for the slowest response of a first fit.
         time: column of the times.
+        columns: of the file by name, where they have other names.
+        units: by name, where the file has none.
         progress: whether a bar on standard error shows how far it is, from two seconds on.
 
     Returns:
@@ -83,27 +100,17 @@ def identify_log(
     if samples is not None and not is_count(samples):
         raise InputError("--samples", samples, "a whole number of 1 or more")
     inputs = (*mv, *dv)
-    log = read_log(path, [*inputs, *cv], dt, time, held=inputs)
-    signals = np.stack([log.values[name] for name in inputs], axis=1)
-    moving = np.array([any(np.ptp(u[own]) > 0 for own in log.segments) for u in signals.T])
-    if not moving.any():
-        raise InputError("data", str(path), f"an input that moves; {', '.join(inputs)} never do")
-    for name in cv:
-        if np.nanstd(log.values[name]) == 0:
-            raise InputError(f"column {name}", float(np.nanmean(log.values[name])), "a CV that changes")
-    cut = round((1 - HELD_OUT) * len(log.times))
-    for name in cv:
-        known = int(np.isfinite(log.values[name][:cut]).sum())
-        if known < LEAST:
-            expected = f"at least {LEAST} values in the first {100 * (1 - HELD_OUT):.0f} % of the log"
-            raise InputError(f"column {name}", f"{known} values", expected)
-    all_data = {name: make_data(log.values[name], signals[:, moving], log.segments) for name in cv}
-    notes = list(log.notes)
+    read = lambda dt: _read(path, inputs, cv, columns or {}, units or {}, dt, time)  # noqa: E731
+    log, signals, moving, cut, all_data = read(dt)
+    notes: list[str] = []
     with tqdm(
         total=len(cv) * (3 if samples is None else 2), desc="identify", delay=2, disable=not progress
     ) as bar:
         if samples is None:
-            samples = _length(all_data, cut, log, bar, notes)
+            samples, short = _length(all_data, cut, log, bar, notes)
+            while short and dt is None:
+                log, signals, moving, cut, all_data = read(COARSER * log.dt)
+                samples, short = _length(all_data, cut, log, bar, notes)
         elif samples > max(own.stop - own.start for own in log.segments) - 2:
             raise InputError("--samples", samples, "fewer samples than the longest segment of the log has")
         found = {
@@ -118,7 +125,7 @@ def identify_log(
         raise InputError("data", str(path), "moves that tell at least one response", reasons)
     silent = np.array([row.verdict == "none" for row in verdicts]).reshape(len(cv), len(inputs), 1)
     steps = np.where(silent, 0.0, np.stack([found[name].steps for name in cv]))
-    notes += _method_notes(log, found, inputs, samples, cut)
+    notes = [*log.notes, *notes, *_method_notes(log, found, inputs, samples, cut)]
     return Identification(
         _model(path, log, mv, cv, dv, steps, verdicts, notes),
         verdicts,
@@ -130,8 +137,43 @@ def identify_log(
     )
 
 
-def _length(all_data: dict[str, Data], cut: int, log: Log, bar: tqdm, notes: list[str]) -> int:
-    """N by the slowest response of first fits, which become longer until all settle well before they end."""
+def _read(
+    path: str | Path,
+    inputs: Sequence[str],
+    cv: Sequence[str],
+    columns: Mapping[str, str],
+    units: Mapping[str, str],
+    dt: float | None,
+    time: str | None,
+) -> tuple[Log, np.ndarray, np.ndarray, int, dict[str, Data]]:
+    """A log that can tell something, its inputs, which of them move, where the first part ends, and each CV with them."""
+    column = {name: columns.get(name, name) for name in (*inputs, *cv)}
+    log = read_log(path, list(column.values()), dt, time, held=[column[name] for name in inputs])
+    own = {
+        field: {name: getattr(log, field)[at] for name, at in column.items() if at in getattr(log, field)}
+        for field in ("values", "units", "quality")
+    }
+    given = {name: unit for name, unit in units.items() if name in column}
+    log = dataclasses.replace(log, **(own | {"units": given | own["units"]}))
+    signals = np.stack([log.values[name] for name in inputs], axis=1)
+    moving = np.array([any(np.ptp(u[own]) > 0 for own in log.segments) for u in signals.T])
+    if not moving.any():
+        raise InputError("data", str(path), f"an input that moves; {', '.join(inputs)} never do")
+    for name in cv:
+        if np.nanstd(log.values[name]) == 0:
+            raise InputError(f"column {name}", float(np.nanmean(log.values[name])), "a CV that changes")
+    cut = round((1 - HELD_OUT) * len(log.times))
+    for name in cv:
+        known = int(np.isfinite(log.values[name][:cut]).sum())
+        if known < LEAST:
+            expected = f"at least {LEAST} values in the first {100 * (1 - HELD_OUT):.0f} % of the log"
+            raise InputError(f"column {name}", f"{known} values", expected)
+    all_data = {name: make_data(log.values[name], signals[:, moving], log.segments) for name in cv}
+    return log, signals, moving, cut, all_data
+
+
+def _length(all_data: dict[str, Data], cut: int, log: Log, bar: tqdm, notes: list[str]) -> tuple[int, bool]:
+    """N by the slowest response of first fits, longer until all settle well before they end; and whether none is so long."""
     inputs = next(iter(all_data.values())).inputs.shape[1]
     longest = max(own.stop - own.start for own in log.segments)
     most = min(longest - 2, max(SHORTEST, min(COLUMNS // inputs, longest // 2)))
@@ -148,13 +190,19 @@ def _length(all_data: dict[str, Data], cut: int, log: Log, bar: tqdm, notes: lis
         if not waiting:
             break
     samples = min(most, max(SHORTEST, int(np.ceil(MARGIN * slowest)) + 1))
-    if slowest > 0.9 * most:
+    short = slowest > 0.9 * most
+    if short and COLUMNS // inputs < longest // 2 and longest // COARSER > 4 * SHORTEST:
+        notes.append(
+            f"responses take longer than {most} samples of {log.dt:g} s: every {COARSER} were made one; --dt says otherwise"
+        )
+        return samples, True
+    if short:
         notes.append(f"N = {samples}, all that could be tried; a response may be slower: try a larger --dt")
     else:
         notes.append(
             f"N = {samples} samples ({samples * log.dt:g} s): a first fit settles in {slowest * log.dt:g} s"
         )
-    return samples
+    return samples, False
 
 
 def _settled(data: Data, length: int) -> int:
@@ -176,7 +224,7 @@ def _settled(data: Data, length: int) -> int:
 
 def _identified(data: Data, length: int, cut: int, signals: np.ndarray, moving: np.ndarray, bar: tqdm) -> _Cv:
     training = data.until(cut)
-    trained = search(training, length)
+    trained, overruled = chosen(data, length, cut)
     bar.update()
     final = fitted(data, length, trained, 30)
     bar.update()
@@ -193,7 +241,7 @@ def _identified(data: Data, length: int, cut: int, signals: np.ndarray, moving: 
     ]
     tested = examined(errors, signals, data.segments, length)
     fits = _fit(data, alone, cut), _fit(data, whole(rough), cut)
-    return _Cv(data, final, *fits, low, steps, band, alone, tested)
+    return _Cv(data, final, *fits, low, steps, band, alone, tested, overruled)
 
 
 def _replaced(fit: Fit, data: Data, band: np.ndarray) -> Fit:
@@ -233,6 +281,8 @@ def _verdict(cv: str, log: Log, name: str, excited, found: _Cv, j: int) -> PairV
         )
     elif _unsettled(s, found.band[j]):
         doubts.append(f"has not settled by sample {len(s)}: more --samples, or a larger --dt")
+    if found.overruled:
+        doubts.append(f"depends on what is taken for noise of {cv}, which its inputs do not move linearly")
     if tested.past[j] > tested.limit:
         doubts.append(
             f"residuals still follow moves of {name} (correlation {tested.past[j]:.2f}): slower or not linear"
@@ -281,6 +331,11 @@ def _method_notes(
         if own.final.free is not None:
             words += "; segments do not begin at rest, so that a free response was fitted at each beginning"
         notes.append(words)
+        if own.overruled:
+            notes.append(
+                f"{name}: with a drifting disturbance, likelier one sample ahead, the part that was left out is predicted "
+                "far worse; bands are too narrow"
+            )
         p = own.tested.white
         if p < WHITE:
             notes.append(f"{name}: residuals are not white (p = {p:.1g}): bands may be too narrow")

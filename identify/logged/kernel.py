@@ -4,6 +4,7 @@ The impulse response of a pair is Gaussian with the covariance ``b exp(-(i + k) 
 diagonal-correlated kernel (Chen, Ohlsson & Ljung 2012, DC); for ``kappa = 2 tau`` it is the tuned-correlated one, TC. Its
 Cholesky factor is known in closed form, so that nothing ill-conditioned is ever factored. The variance of the noise is
 eliminated; what is maximised is the likelihood of the data with all responses integrated out (Pillonetto et al. 2014).
+Hyperparameters of long responses are searched with late lags taken together; the responses themselves have all lags.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from identify.logged.regression import Sums
 
 NUGGET = 1e-11  # of the square of the CV, which rounding makes of sums of squares
 LAGS = (16, 32, 64, 96, 128, 192, 256, 384, 512, 768)  # sizes that programs are compiled for
+DENSE = 32  # lags of each spacing, 1, 2, 4, ..., where hyperparameters are searched
 INPUTS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 SCREENED = [(tau, size) for tau in (0.03, 0.1, 0.25, 0.6) for size in (-2.0, 2.0, 6.0, 12.0)]
 
@@ -43,14 +45,14 @@ class Posterior:
     parameters: Float[np.ndarray, "input 3"]
 
 
-def factors(parameters: Float[Array, "input 3"], length: int) -> Float[Array, "input n n"]:
-    """Lower triangular L with the covariance L L' of every pair."""
-    lag = jnp.arange(length)
+def factors(parameters: Float[Array, "input 3"], lag: Float[Array, " n"]) -> Float[Array, "input n n"]:
+    """Lower triangular L with the covariance L L' of every pair at these lags, the first of which is 0."""
     size, tau, kappa = (jnp.exp(parameters[:, k])[:, None, None] for k in range(3))
     decay = _exponential(-0.5 * (lag + 1.0) / tau[:, 0])
     apart = jnp.maximum(lag[:, None] - lag, 0)
     correlation = jnp.where(lag[:, None] >= lag, _exponential(-apart / kappa), 0.0)  # of an AR 1 process
-    first = jnp.where(lag == 0, 1.0, jnp.sqrt(-jnp.expm1(-2.0 / kappa)))
+    apart = jnp.diff(lag, prepend=-1.0)
+    first = jnp.where(lag == 0, 1.0, jnp.sqrt(-jnp.expm1(-2.0 * apart / kappa)))
     return jnp.sqrt(size) * decay[:, :, None] * correlation * first
 
 
@@ -59,10 +61,20 @@ def _exponential(exponent: Array) -> Array:
     return jnp.where(exponent > -60.0, jnp.exp(jnp.maximum(exponent, -60.0)), 0.0)
 
 
-def _solved(parameters, gram, right, square):
+def knots(length: int) -> Float[np.ndarray, " n"]:
+    """Lags of `length`, ever further apart."""
+    found, spacing = [], 1
+    while not found or found[-1] < length - 1:
+        begin = found[-1] + spacing if found else 0
+        found += range(begin, begin + DENSE * spacing, spacing)
+        spacing *= 2
+    return np.array([*(lag for lag in found if lag < length - 1), length - 1], dtype=float)
+
+
+def _solved(parameters, lag, gram, right, square):
     """``(L, Cholesky factor of I + L' G L, its solve of L' b, square that is left)``."""
     inputs, length = right.shape
-    low = factors(parameters, length)
+    low = factors(parameters, lag)
     half = jnp.einsum("jak,jami->jkmi", low, gram)
     whole = jnp.einsum("jkmi,mil->jkml", half, low).reshape(inputs * length, -1)
     root = jnp.linalg.cholesky(jnp.eye(inputs * length) + 0.5 * (whole + whole.T))
@@ -70,20 +82,21 @@ def _solved(parameters, gram, right, square):
     return low, root, seen, square - seen @ seen
 
 
-def score(parameters, gram, right, square, floor, count):
+def score(parameters, lag, gram, right, square, floor, count):
     """Twice the negative logarithm of the marginal likelihood, the variance of the noise eliminated."""
-    _, root, _, left = _solved(parameters, gram, right, square)
+    _, root, _, left = _solved(parameters, lag, gram, right, square)
     value = count * jnp.log((jnp.maximum(left, 0.0) + floor) / count) + 2 * jnp.log(jnp.diag(root)).sum()
     return jnp.where(jnp.isfinite(value), value, 1e30)
 
 
+_score = jax.jit(score)
 _scored = jax.jit(jax.value_and_grad(score))
-_screened = jax.jit(jax.vmap(score, in_axes=(0, None, None, None, None, None)))
+_screened = jax.jit(jax.vmap(score, in_axes=(0, *[None] * 6)))
 
 
 @jax.jit
-def _posterior(parameters, gram, right, square, floor, count):
-    low, root, seen, left = _solved(parameters, gram, right, square)
+def _posterior(parameters, lag, gram, right, square, floor, count):
+    low, root, seen, left = _solved(parameters, lag, gram, right, square)
     back = jax.scipy.linalg.solve_triangular(root, jnp.eye(len(root)), lower=True)  # C^-1
     inputs, length = right.shape
     spread = jnp.einsum("jak,pjk->jap", low, back.reshape(-1, inputs, length))  # L (C')^-1
@@ -91,17 +104,30 @@ def _posterior(parameters, gram, right, square, floor, count):
     return jnp.einsum("jap,p->ja", spread, seen), jnp.sqrt(variance) * spread, variance
 
 
-def padded(data: Sums) -> tuple[tuple[Array, ...], int, int]:
-    """The sums in one of few sizes; what is added has no effect on likelihood and responses."""
-    inputs, length = data.right.shape
+def padded(data: Sums, lags: Float[np.ndarray, " n"] | None = None) -> tuple[Array, ...]:
+    """Lags and sums in one of few sizes; what is added has no effect on likelihood and responses.
+
+    Args:
+        data: with all lags.
+        lags: that responses are interpolated from; all if not given.
+    """
+    gram, right = data.gram, data.right
+    every = np.arange(right.shape[1], dtype=float)
+    if lags is None:
+        lags = every
+    else:
+        shapes = np.stack([np.interp(every, lags, unit) for unit in np.eye(len(lags))], axis=1)
+        gram, right = np.einsum("jami,ak,il->jkml", gram, shapes, shapes, optimize=True), right @ shapes
+    inputs, length = right.shape
     more = (
         next((k for k in INPUTS if k >= inputs), inputs) - inputs,
         next((k for k in LAGS if k >= length), length) - length,
     )
     extra = [(0, more[0]), (0, more[1])]
-    arrays = np.pad(data.gram, extra * 2), np.pad(data.right, extra)
+    beyond = np.concatenate([lags, lags[-1] + 1 + np.arange(more[1])])
+    arrays = beyond, np.pad(gram, extra * 2), np.pad(right, extra)
     numbers = data.square, NUGGET * max(data.square, 1e-300), float(data.count)
-    return tuple(map(jnp.asarray, (*arrays, *numbers))), inputs, length
+    return tuple(map(jnp.asarray, (*arrays, *numbers)))
 
 
 def estimate(
@@ -114,8 +140,10 @@ def estimate(
         start: hyperparameters to begin from; screened over equal ones of all pairs if not given.
         iterations: of L-BFGS-B at most; 0 keeps those of the start.
     """
-    arrays, inputs, length = padded(data)
-    size = arrays[1].shape[0]
+    inputs, length = data.right.shape
+    arrays = padded(data)
+    searched = padded(data, knots(length)) if iterations and length > 3 * DENSE else arrays
+    size = arrays[2].shape[0]
     bounds = [
         (-16.0, float(np.log(1e13 / max(data.count, 1)))),
         (np.log(0.3), np.log(3.0 * length)),
@@ -128,7 +156,7 @@ def estimate(
             for tau, amount in SCREENED
         ]
         tried = np.repeat(np.clip(each, low, high)[:, None], size, axis=1)
-        begin = tried[int(np.argmin(_screened(jnp.asarray(tried), *arrays)))][:inputs]
+        begin = tried[int(np.argmin(_screened(jnp.asarray(tried), *searched)))][:inputs]
     else:
         begin = start
     x = np.zeros((size, 3))
@@ -136,7 +164,7 @@ def estimate(
 
     def value(free: np.ndarray) -> tuple[float, np.ndarray]:
         x[:inputs] = free.reshape(inputs, 3)
-        found, slope = _scored(jnp.asarray(x), *arrays)
+        found, slope = _scored(jnp.asarray(x), *searched)
         return float(found), np.asarray(slope)[:inputs].ravel()
 
     if iterations:
@@ -144,10 +172,8 @@ def estimate(
         found = minimize(
             value, x[:inputs].ravel(), jac=True, method="L-BFGS-B", bounds=bounds * inputs, options=options
         )
-        best = found.x.reshape(inputs, 3)
-    else:
-        best = x[:inputs].copy()
-    final = value(best.ravel())[0] + data.constant
+        x[:inputs] = found.x.reshape(inputs, 3)
+    final = float(_score(jnp.asarray(x), *arrays)) + data.constant
     mean, root, variance = _posterior(jnp.asarray(x), *arrays)
     kept = np.asarray(root)[:inputs, :length]
-    return Posterior(np.asarray(mean)[:inputs, :length], kept, float(variance), final, best)
+    return Posterior(np.asarray(mean)[:inputs, :length], kept, float(variance), final, x[:inputs].copy())

@@ -28,6 +28,17 @@ FAR = 10.0  # ranges of an input off its median, for two rows at most: a value t
 UPDATED = 3  # rows from which on a CV that changes at equal intervals only is one that is held in between
 HOUR = 3600.0  # s by which clocks are set back in autumn
 LEAST = 20  # samples
+CODES = (
+    -9999.0,
+    9999.0,
+    -999.0,
+    999.0,
+    -99999.0,
+    99999.0,
+    -999.25,
+    -32768.0,
+    32767.0,
+)  # for no value, if far away
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,6 +114,7 @@ def read_log(
         if not np.isfinite(values).any():
             raise InputError(f"column {name}", "no value in any row", "numbers")
         if clean:
+            values = _without_codes(name, values, notes)
             table.columns[name] = (_plausible if name in held else _cleaned)(name, values, notes)
     typical = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
     if dt is None:
@@ -147,6 +159,17 @@ def _in_order(table: Table, notes: list[str]) -> Table:
     order = order[keep]
     columns = {name: values[order] for name, values in table.columns.items()}
     return table._replace(stamps=stamps[order], columns=columns)
+
+
+def _without_codes(name: str, values: np.ndarray, notes: list[str]) -> np.ndarray:
+    """A column without numbers that stand for no value, such as -9999, where all others are far away from them."""
+    for code in CODES:
+        own = values == code
+        others = values[~own & np.isfinite(values)]
+        if own.any() and others.size and np.abs(others - code).min() > FAR * max(np.ptp(others), 0.1):
+            notes.append(f"{name}: {own.sum()} values of {code:g} count as missing")
+            values = np.where(own, np.nan, values)
+    return values
 
 
 def _plausible(name: str, values: np.ndarray, notes: list[str]) -> np.ndarray:

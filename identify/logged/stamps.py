@@ -16,13 +16,29 @@ EPOCHS = ((1e17, 1e9, "nanoseconds"), (1e14, 1e6, "microseconds"), (1e11, 1e3, "
 PARTS = re.compile(
     r"^(\d{1,2})([./-])(\d{1,2})\2(\d{4}|\d{2})(?:[ T,]+(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d+))?)?\s*([AaPp][Mm])?)?$"
 )
+CLOCK = re.compile(r"^(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d+))?)?\s*([AaPp][Mm])?$")
+DAY = 86400.0  # s
+DAYS = (
+    (25569.0, 73050.0, 25569.0),
+    (719529.0, 767010.0, 719529.0),
+)  # of Excel and MATLAB, 1970 to 2100, and 1970
 WORDS = ("%d-%b-%y %H:%M:%S", "%d-%b-%Y %H:%M:%S", "%d %b %Y %H:%M:%S", "%b %d, %Y %H:%M:%S")
 EXPECTED = "a time: seconds, a date like 2024-03-01 12:00:00, or seconds since 1970"
 
 
 def is_stamp(text: str) -> bool:
-    """Whether a text reads as a date."""
-    return bool(PARTS.match(text)) or _iso(text) is not None
+    """Whether a text reads as a date or a time of day."""
+    return bool(PARTS.match(text) or CLOCK.match(text)) or _iso(text) is not None
+
+
+def is_clock(text: str) -> bool:
+    """Whether a text is a time of day alone."""
+    return bool(CLOCK.match(text))
+
+
+def is_day(text: str) -> bool:
+    """Whether a text is a date without a time."""
+    return is_stamp(text) and ":" not in text
 
 
 def seconds(
@@ -43,7 +59,7 @@ def seconds(
     try:
         numbers = np.array([t.replace(",", ".") if decimal else t for t in texts], dtype=float)
     except ValueError:
-        return _dates(texts, field)
+        return _clock(texts, field) if texts and is_clock(texts[0]) else _dates(texts, field)
     return _epoch(_checked(numbers, texts, field))
 
 
@@ -58,7 +74,28 @@ def _epoch(numbers: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
     for size, per_second, word in EPOCHS:
         if len(numbers) and abs(np.median(numbers)) > size:
             return numbers / per_second, (f"times were taken for {word} since 1970",)
+    steps = np.abs(np.diff(numbers))
+    for low, high, begin in DAYS:
+        inside = len(steps) > 0 and ((numbers >= low) & (numbers <= high)).all()
+        if inside and 0 < np.median(steps) < 0.1 and np.ptp(numbers * DAY) > 1:
+            whole = np.round((numbers - begin) * DAY, 3)  # what is finer is rounding of the days
+            return whole, ("times were taken for days, as Excel and MATLAB count them",)
     return numbers, ()
+
+
+def _clock(texts: list[str], field: Any) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Times of day, which begin a new day where they go back by more than half of one."""
+    out = np.empty(len(texts))
+    for k, text in enumerate(texts):
+        found = CLOCK.match(text)
+        hour, minute, second = (int(found[j] or 0) for j in (1, 2, 3)) if found else (99, 0, 0)
+        if found and found[5]:
+            hour = hour % 12 + (12 if found[5].lower() == "pm" else 0)
+        if found is None or hour > 24 or minute > 59 or second > 59:
+            raise InputError(field(k), text, EXPECTED)
+        out[k] = 3600 * hour + 60 * minute + second + float(f"0.{found[4] or 0}")
+    days = np.cumsum(np.diff(out, prepend=out[:1]) < -DAY / 2)
+    return out + DAY * days, ("times are of a day; a new one begins where they go back by half a day",)
 
 
 def _dates(texts: list[str], field: Any) -> tuple[np.ndarray, tuple[str, ...]]:

@@ -16,22 +16,38 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from identify.logged.stamps import is_stamp, seconds
+from identify.logged.stamps import is_clock, is_day, is_stamp, seconds
 from jaxmpc.errors import InputError, near
 
 WORDS = (
     "nan na n/a null none bad - -- --- ? no_data nodata invalid questionable uncertain offline error shutdown"
 )
 SENTENCES = (
-    "no data",
-    "bad input",
-    "i/o timeout",
-    "not connect",
-    "scan off",
-    "pt created",
-    "out of serv",
-    "#n/a",
+    *(
+        "no data",
+        "bad input",
+        "i/o timeout",
+        "not connect",
+        "scan off",
+        "pt created",
+        "out of serv",
+        "calc failed",
+    ),
+    *(
+        "arc off-line",
+        "intf shut",
+        "comm fail",
+        "over range",
+        "under range",
+        "no sample",
+        "equip fail",
+        "no result",
+    ),
+    *("configure", "#n/a", "#value!", "#ref!", "#div/0!", "#num!", "<null>"),
 )
+CODED = re.compile(r"^\[-\d+\]")  # an error number and words of it
+PAIRS = ("off on", "false true", "no yes", "closed open", "stopped running", "stop run", "inactive active")
+TRUTHS = {word: float(k) for pair in PAIRS for k, word in enumerate(pair.split())}
 MISSING = frozenset(("", *WORDS.split(), *SENTENCES))
 UNIT = re.compile(r"^(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))$")  # NAME [UNIT] or NAME (UNIT)
 GROUPED = re.compile(r"^[+-]?\d{1,3}(\.\d{3})*(,\d+)?([eE][+-]?\d+)?$|^[+-]?\d*,?\d+([eE][+-]?\d+)?$")
@@ -84,12 +100,19 @@ def read_table(path: str | Path, names: Sequence[str], time: str | None) -> Tabl
         if decimal:
             notes.append("numbers have a decimal comma")
     line = (first[0] if not parquet else 1) + unit_row
-    columns = {name: _numbers(name, rows[places[name]], line, decimal) for name in names}
+    columns = {}
+    for name in names:
+        columns[name], said = _numbers(name, rows[places[name]], line, decimal)
+        notes += said
     if not len(next(iter(columns.values()))):
         raise InputError("data", str(path), "rows of values below the names")
     stamps, begin = None, ""
     if at is not None and len(rows[at]):
-        stamps, said = seconds(heads[at], rows[at], line, decimal)
+        given, clock = rows[at], _clock_column(rows, places, at)
+        if clock is not None:
+            given = [f"{day} {time}" for day, time in zip(given, rows[clock], strict=True)]
+            notes.append(f"times are the columns {heads[at]} and {heads[clock]} together")
+        stamps, said = seconds(heads[at], given, line, decimal)
         begin, notes = str(rows[at][0]).strip(), [*notes, *said]
         if len(stamps) > 1 and not np.ptp(stamps):
             expected = "times that go on; where date and time are two columns, make one of them"
@@ -103,7 +126,7 @@ def _csv(path: str | Path, names: Sequence[str]) -> tuple[list[str], list[list[s
         raw = Path(path).read_bytes()
     except OSError as error:
         raise InputError("data", str(path), f"a file that can be read ({error.strerror or error})") from None
-    text = _decoded(raw).replace("\0", "")
+    text = _decoded(raw).replace("\0", "").replace("\r\n", "\n").replace("\r", "\n")
     lines = [line for line in text.splitlines()[:50] if line.strip()]
     if not lines:
         raise InputError("data", str(path), "a row of names and rows of values; the file is empty")
@@ -185,10 +208,19 @@ def _time_column(
     return next(iter(likely), None)
 
 
+def _clock_column(rows: Sequence[Any], places: dict[str, int], at: int) -> int | None:
+    """The column with the times of day that belong to a column of dates; None if they have times themselves."""
+    texts = [str(entry).strip() for entry in rows[at][:50]]
+    if not all(map(is_day, texts)):
+        return None
+    free = [k for k in range(len(rows)) if k != at and k not in places.values()]
+    return next((k for k in free if all(is_clock(str(entry).strip()) for entry in rows[k][:50])), None)
+
+
 def _is_unit_row(texts: Iterable[str], decimal: bool) -> bool:
     """Whether none of them is a number or a known word, and one has a letter, a percent sign or a degree."""
     texts = [str(text).strip() for text in texts]
-    plain = [t for t in texts if t.lower() not in MISSING or t == "-"]
+    plain = [t for t in texts if t.lower() not in MISSING | TRUTHS.keys() or t == "-"]
     return (
         bool(plain) and all(_number(t, decimal) is None and not is_stamp(t) for t in plain) and plain != ["-"]
     )
@@ -203,8 +235,11 @@ def _number(text: str, decimal: bool) -> float | None:
         return None
 
 
-def _numbers(name: str, texts: Sequence[Any], line: int, decimal: bool) -> Float[np.ndarray, " row"]:
-    """A column as floats; NaN for what stands for no value."""
+def _numbers(
+    name: str, texts: Sequence[Any], line: int, decimal: bool
+) -> tuple[Float[np.ndarray, " row"], list[str]]:
+    """A column as floats, NaN for what stands for no value, and what was assumed."""
+    notes = []
     if isinstance(texts, np.ndarray) and texts.dtype.kind in "biuf":
         out = texts.astype(float)
     else:
@@ -214,13 +249,19 @@ def _numbers(name: str, texts: Sequence[Any], line: int, decimal: bool) -> Float
                 raise ValueError
             out[:] = np.array(texts, dtype=float)
         except (ValueError, TypeError):
+            words = {"" if text is None else str(text).strip().lower() for text in texts}
+            truths = TRUTHS if words - MISSING and words - MISSING <= TRUTHS.keys() else {}
+            if truths:
+                one = ", ".join(sorted(word for word in words - MISSING if truths[word]))
+                notes.append(f"{name}: {one or 'nothing'} was taken for 1, the other for 0")
             for k, text in enumerate(texts):
-                out[k] = _value(name, text, line + k, decimal)
-    return np.where(np.abs(out) < 1e30, out, np.nan)
+                known = truths.get(str(text).strip().lower())
+                out[k] = _value(name, text, line + k, decimal) if known is None else known
+    return np.where(np.abs(out) < 1e30, out, np.nan), notes
 
 
 def _value(name: str, text: Any, row: int, decimal: bool) -> float:
-    if text is None or str(text).strip().lower() in MISSING:
+    if text is None or str(text).strip().lower() in MISSING or CODED.match(str(text)):
         return np.nan
     value = _number(str(text).strip(), decimal)
     if value is None:

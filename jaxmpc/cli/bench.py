@@ -26,6 +26,7 @@ READ = "solve the case files of a folder, and hold the answers against its truth
     option("--figures", "DIR", DRAWN, Path),
     option("--write", "DIR", WRITTEN, Path),
     option("--read", "DIR", READ, Path),
+    option("--data", "DIR", "published data for identification (default: downloaded into the cache)", Path),
     switch("--certify", "with --read: ask the other solvers too, and write truth.json"),
     epilog="Times are wall times [ms] or [s], rates are per second. The other solvers come with pip install "
     "'jaxmpc[bench]'; one that is not installed is named as missing. Ctrl-C prints what was measured so far. "
@@ -50,7 +51,7 @@ def bench(options: Options) -> int:
     def show(report: Any) -> None:
         print(table(report), end="", flush=True)
 
-    given = {"quick": options.quick, "only": options.only, "json_path": options.json}
+    given = {"quick": options.quick, "only": options.only, "json_path": options.json, "data": options.data}
     report = run_bench(**given, folder=options.read, certify=options.certify, stopped=show)
     show(report)
     if options.figures is not None:

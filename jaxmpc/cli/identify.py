@@ -111,10 +111,11 @@ def identify(options: Options) -> int:
 def _identify_process(options: Options) -> int:
     """Settle a plant of a process and step each MV, and each measured disturbance, alone."""
     check_target("--out", options.out)
-    from identify.plants import closing, identified, open_plant
+    from identify.plants import identified, open_plant
     from identify.step_test import settling_notes
     from jaxmpc.check import among
     from jaxmpc.process.file import DEFAULT_PROCESS, load_process
+    from jaxmpc.process.plant import closing
 
     process = load_process(options.source or DEFAULT_PROCESS)
     point, steps = (

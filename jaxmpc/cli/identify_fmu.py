@@ -51,7 +51,8 @@ def identify_fmu(options: Options) -> int:
     if len(set(cvs)) != len(cvs):
         raise InputError("--cv", list(cvs), "each CV once")
     start = {name: _value(text or "") for name, text in _named("--set", options.set or ())}
-    from identify import fmu_steps
+    from identify.fmu_steps import identify_fmu as identified
+    from identify.fmu_sweep import identify_fmu_schedule
     from jaxmpc.programs.progress import shown, watched
 
     given: dict[str, Any] = {"start": start, "settle": options.settle}
@@ -61,8 +62,8 @@ def identify_fmu(options: Options) -> int:
     wanted = (options.source, mvs, cvs, options.dt, 250 if options.samples is None else options.samples)
     try:
         with shown(), watched(lambda seconds: f"{seconds:.0f} s: {doing[0]}"):
-            swept = fmu_steps.identify_fmu_schedule(*wanted, at, **given) if at else None
-            found = fmu_steps.identify_fmu(*wanted, dvs=dvs, **given)
+            swept = identify_fmu_schedule(*wanted, at, **given) if at else None
+            found = identified(*wanted, dvs=dvs, **given)
     except InputError as error:
         field = next(
             (error.field.replace(own, to) for own, to in FIELDS.items() if error.field.startswith(own)),
@@ -70,10 +71,10 @@ def identify_fmu(options: Options) -> int:
         )
         raise InputError(field, error.value, error.expected, error.hint) from None
     if swept is not None:
-        found = _with_sweep(found, swept)
+        found = _with_sweep(found, swept[1])
     status = written(found, out, page, *([schedule] if at else []))
     if swept is not None:
-        swept.save(schedule)
+        swept[0].save(schedule)
     return status
 
 
@@ -129,25 +130,15 @@ def _value(text: str) -> Any:
         return text
 
 
-def _with_sweep(found: Any, swept: Any) -> Any:
-    """An identification with the gains of a schedule among its notes, and its responses beside the others."""
-    import itertools
-
-    import numpy as np
-
-    coefficients = np.asarray(swept.coefficients)
-    values = [np.asarray(one).tolist() for one in swept.grid]
-    places = [
-        ", ".join(f"{name} = {value:g}" for name, value in zip(swept.scheduled, point, strict=True))
-        for point in itertools.product(*values)
-    ]
-    flat = coefficients.reshape(-1, *coefficients.shape[len(values) :])
-    notes, model = [], swept.reference
-    for i, cv in enumerate(model.cv_names):
-        for j, mv in enumerate(model.mv_names):
-            gains = "; ".join(
-                f"{place}: {gain:.4g}" for place, gain in zip(places, flat[:, i, j, -1], strict=True)
-            )
-            notes.append(f"gain of {mv} on {cv} at {gains}")
-    alternatives: Mapping[str, Any] = {**found.alternatives, **dict(zip(places, flat, strict=True))}
-    return dataclasses.replace(found, notes=(*found.notes, *notes), alternatives=alternatives)
+def _with_sweep(found: Any, swept: Mapping[str, Any]) -> Any:
+    """An identification with what was found at each place: the map of gains, the verdicts there, and the responses."""
+    notes = []
+    for k, row in enumerate(found.verdicts):
+        cv, mv = divmod(k, len(found.model.input_names))
+        gains = "; ".join(f"{place}: {own.responses[cv, mv, -1]:.4g}" for place, own in swept.items())
+        notes.append(f"gain of {row.input} on {row.cv} at {gains}")
+    for place, own in swept.items():
+        notes += [f"at {place}, {row.input} on {row.cv} is {row.verdict}: {row.says}" for row in own.verdicts]
+    responses = {place: own.responses for place, own in swept.items()}
+    notes = (*found.notes, *notes)
+    return dataclasses.replace(found, notes=notes, alternatives={**found.alternatives, **responses})

@@ -7,6 +7,7 @@ all cores have work, and only the FMUs of the parts under way have a process.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable, Sequence
 
@@ -17,7 +18,7 @@ from jaxmpc.errors import PlantError
 from jaxmpc.loop.compiled import Inputs
 from jaxmpc.loop.events import Stage
 from jaxmpc.loop.host import HostLoops, undisturbed
-from jaxmpc.process.plant import StatefulPlant
+from jaxmpc.process.plant import StatefulPlant, closing
 from jaxmpc.programs.compilation import compiling_for
 from jaxmpc.programs.threads import parts_of, side_by_side
 
@@ -62,13 +63,11 @@ def simulate_host_lanes(
                 with lock:
                     progress(len(own))
 
-        try:
+        with contextlib.ExitStack() as stack:
+            for plant in own:
+                stack.enter_context(closing(plant))
             run.begin(own)
             fields = run.advanced(own, tick, stopped)
-        finally:
-            for plant in own:
-                if hasattr(plant, "close"):
-                    plant.close()  # pyright: ignore[reportAttributeAccessIssue]
         failures.update({first + lane: error for lane, error in run.failed.items()})
         return {name: values[: len(own)] for name, values in fields.items()}
 

@@ -5,9 +5,10 @@ stepped from the host; nothing has to inherit from it. Disturbances are a vector
 Plants list their parameters, and any of these may vary from lane to lane (`lanes_of_plants`).
 """
 
+import contextlib
 import dataclasses
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import equinox as eqx
@@ -184,6 +185,17 @@ class StatefulPlant(Protocol):
     def step(self, mv: np.ndarray, disturbance: Any, /) -> PlantOutputs:
         """One sample with these demands ``"mv"`` [MV unit] and disturbances; what is measured at its end."""
         ...
+
+
+@contextlib.contextmanager
+def closing(plant: Any) -> Iterator[Any]:
+    """A plant, freed at the end if it holds anything outside Python."""
+    try:
+        yield plant
+    finally:
+        close = getattr(plant, "close", None)
+        if close is not None:
+            close()
 
 
 def disturbances_of(plant: Any) -> tuple[str, ...]:

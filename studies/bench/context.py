@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
+from pathlib import Path
 
 from identify.step_test import identify_step_response
 from jaxmpc.model.step_response import StepResponseModel
@@ -82,6 +83,7 @@ class Context:
     say: Callable[[str], None]  # receives a line of progress
     qp_peers: tuple[Peer, ...]
     miqp_peers: tuple[Peer, ...]
+    data: Path | None = None  # folder with published data; they are downloaded without
     # for figures, filled by the sections
     series: dict[str, dict[str, list[float]]] = dataclasses.field(default_factory=dict)
 

@@ -56,6 +56,7 @@ def run_bench(
     json_path: Path | None = None,
     folder: Path | None = None,
     certify: bool = False,
+    data: Path | None = None,
     size: Size | None = None,
     peers: tuple[tuple[Peer, ...], tuple[Peer, ...]] = (QP_PEERS, MIQP_PEERS),
     say: Callable[[str], None] | None = None,
@@ -69,6 +70,7 @@ def run_bench(
         json_path: file that gets every row, replaced as a whole after each section.
         folder: instances that are solved in place of the sections.
         certify: ask the other solvers too, and write a ``truth.json`` into the folder.
+        data: folder with the published data of the section ``identification``; they are downloaded without.
         size: how much is measured, if neither the full nor the quick amount.
         peers: QP and MIQP solvers to compare with; ratios are to the first of each.
         say: receives lines of progress; standard error if not given.
@@ -86,7 +88,7 @@ def run_bench(
     if folder is not None:
         instances = *read(folder), folder if certify else None
         sections = {"read": lambda context: found(context, *instances)}
-    context = Context(size or (QUICK if quick else FULL), quick, say or _told(), *peers)
+    context = Context(size or (QUICK if quick else FULL), quick, say or _told(), *peers, data)
     report = Report(machine=machine(peers), options={"quick": quick, "sections": list(sections)})
     report.series = context.series
 

@@ -22,6 +22,7 @@ from jaxmpc.loop.noise import check_deviation, check_seed
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.problem.tuning import LIMIT_PAIRS
+from jaxmpc.process.plant import closing
 from jaxmpc.process.reference import Reference
 from studies.definition.axes import AxisTable
 from studies.definition.sections import ReferenceDefinition
@@ -307,14 +308,11 @@ def _plant(settings: Settings) -> dict[str, np.ndarray]:
         out[parameter] = scale * settings.numbers(key)
     if not out:
         return out
-    plant = open_plant(process, name)
-    try:
-        plant.replaced({key: np.broadcast_to(values, settings.count) for key, values in out.items()})
-    except InputError as error:
-        raise _located(settings, plant, out, error) from None
-    finally:
-        if hasattr(plant, "close"):
-            plant.close()
+    with closing(open_plant(process, name)) as plant:
+        try:
+            plant.replaced({key: np.broadcast_to(values, settings.count) for key, values in out.items()})
+        except InputError as error:
+            raise _located(settings, plant, out, error) from None
     return out
 
 

@@ -15,14 +15,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from identify.plants import closing, disturbance_of, open_plant
+from identify.plants import disturbance_of, open_plant
 from jaxmpc.controller.batch import Controllers
 from jaxmpc.files import strict_json
 from jaxmpc.loop.simulate import simulate_batches
 from jaxmpc.loop.trajectory import TrajectoryBatch
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.tuning import stack_tunings
-from jaxmpc.process.plant import JaxPlant, lanes_of_plants
+from jaxmpc.process.plant import JaxPlant, closing, lanes_of_plants
 from jaxmpc.process.process import Process
 from jaxmpc.programs.clock import Clock
 from jaxmpc.programs.lanes import Lanes

@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
-from identify.plants import closing, disturbance_of, fitting, load_model
+from identify.plants import disturbance_of, fitting, load_model
 from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.schedule import ModelSchedule, ScheduledController
 from jaxmpc.errors import InputError
@@ -30,6 +30,7 @@ from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure
 from jaxmpc.problem.tuning import FIELDS as TUNING
 from jaxmpc.process.file import process_digest
+from jaxmpc.process.plant import closing
 from jaxmpc.process.process import Process
 from jaxmpc.programs.clock import Clock
 from studies.definition.comparison import ComparisonDefinition, ControllerDefinition

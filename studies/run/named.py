@@ -8,10 +8,11 @@ from typing import Any
 
 import xarray as xr
 
-from identify.plants import closing, model_of, open_plant, plant_facts, signals_in
+from identify.plants import model_of, open_plant, plant_facts, signals_in
 from identify.schedule import identify_schedule
 from identify.step_test import settling_notes
 from jaxmpc.errors import InputError
+from jaxmpc.process.plant import closing
 from studies.definition.catalogue import Comparison
 from studies.run.comparison import run_comparison
 from studies.store.files import RESULTS

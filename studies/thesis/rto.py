@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from identify.plants import closing, model_of, open_plant, plant_facts
+from identify.plants import model_of, open_plant, plant_facts
 from identify.steady_map import steady_map
 from jaxmpc.controller.controller import Controller
 from jaxmpc.files import write_atomically
@@ -24,6 +24,7 @@ from jaxmpc.loop.simulate import simulate
 from jaxmpc.loop.trajectory import Trajectory
 from jaxmpc.model.step_response import StepResponseModel
 from jaxmpc.problem.structure import Structure
+from jaxmpc.process.plant import closing
 from jaxmpc.process.reference import Reference
 from jaxmpc.process.well.grids import LIFT_RANGES, STEADY_MAP
 from jaxmpc.steady.map import SteadyMap

@@ -14,10 +14,10 @@ import fmpy
 import numpy as np
 import pytest
 
-from identify import fmu_worker
+from identify import fmu_file, fmu_worker
 from identify.fmu import FmuPlant
+from identify.fmu_file import RefusedError, check_archive
 from identify.fmu_process import FmuProcess
-from identify.fmu_worker import RefusedError, check_archive
 from identify.well_fmu import WellFmuPlant
 from jaxmpc.errors import InputError, PlantError
 from tests import fmus
@@ -301,6 +301,21 @@ def description(old, new):
     return {"modelDescription.xml": fmus.describe().replace(old, new)}
 
 
+def test_a_description_that_breaks_rules_without_harm_is_used_and_its_flaws_are_told(tmp_path):
+    text = (
+        fmus.describe()
+        .replace('<Unit name="m3/h"/>', '<Unit name="bar"/>')
+        .replace('<Integer start="0"/>', "<Integer/>")
+    )
+    path = fmus.make_fmu(tmp_path, text)
+    with plant_of(path) as plant:
+        assert plant.description.flaws == (
+            'Variable "n" (line 9) has no start value.',
+            'The unit "m3/h" of variable "u" (line 8) is not defined.',
+        )
+        assert 'flaws       Variable "n"' in plant.description.table()
+
+
 LIBRARY = f"binaries/{fmpy.platform}/sum{fmpy.sharedLibraryExtension}"
 
 
@@ -392,15 +407,15 @@ def test_an_archive_larger_than_allowed_or_than_the_disk_is_refused(tmp_path, mo
     check_archive(path, free=10**9)
     with pytest.raises(RefusedError, match="fits on the disk"):
         check_archive(path, free=100)
-    monkeypatch.setattr(fmu_worker, "MAX_FILES", 1)
+    monkeypatch.setattr(fmu_file, "MAX_FILES", 1)
     with pytest.raises(RefusedError, match="at most 1 files"):
         check_archive(path, free=10**9)
     monkeypatch.undo()
-    monkeypatch.setattr(fmu_worker, "MAX_BYTES", 100)
+    monkeypatch.setattr(fmu_file, "MAX_BYTES", 100)
     with pytest.raises(RefusedError, match="at most 100 bytes"):
         check_archive(path, free=10**9)
     monkeypatch.undo()
-    monkeypatch.setattr(fmu_worker, "MAX_DESCRIPTION_BYTES", 100)
+    monkeypatch.setattr(fmu_file, "MAX_DESCRIPTION_BYTES", 100)
     with pytest.raises(RefusedError, match=r"a modelDescription.xml of at most 100 bytes"):
         check_archive(path, free=10**9)
 
@@ -411,5 +426,5 @@ def test_a_table_of_contents_that_lies_about_a_size_unpacks_no_more_than_it_says
     path.write_bytes(content)
     check_archive(path, free=100_000)
     with pytest.raises(RefusedError, match="an undamaged FMU"):
-        fmu_worker.unpack(path, tmp_path / "out")
+        fmu_file.unpack(path, tmp_path / "out")
     assert sum(file.stat().st_size for file in (tmp_path / "out").rglob("*") if file.is_file()) < 100_000

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from identify.fmu import FmuPlant
-from identify.fmu_steps import identify_fmu, identify_fmu_schedule
+from identify.fmu_steps import identify_fmu
+from identify.fmu_sweep import identify_fmu_schedule
 from jaxmpc.cli.main import main
 from jaxmpc.controller.schedule import ModelSchedule
 from jaxmpc.errors import InputError, PlantError
@@ -25,8 +26,9 @@ EXACT = 2 * (1 - np.exp(-T / 100))
 CLOSE = 1e-5  # of a coefficient: the solvers are better, what is asked for is 5e-3
 
 
-def plant(folder, variables=(U, Y), kind="CoSimulation", **code):
-    return make_plant(folder, list(variables), kind, units=("%", "m"), **(code or LAG))
+def plant(folder, variables=(U, Y), kind="CoSimulation", fmi=2, starts=0.0, step=1.0, **code):
+    given = {"units": ("%", "m"), "fmi": fmi, "starts": starts, "step": step}
+    return make_plant(folder, list(variables), kind, **given, **(code or LAG))
 
 
 def found(path, mvs=None, cvs=("y",), samples=N, **more):
@@ -110,6 +112,49 @@ def test_what_a_plant_does_besides_is_not_in_its_response(tmp_path, code, exact)
     assert off(found(plant(tmp_path, states=2, **code)), exact) < CLOSE
 
 
+@pytest.mark.parametrize("kind", ["CoSimulation", "ModelExchange"])
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_plant_of_either_version_is_found_from_where_its_experiment_begins(tmp_path, kind, fmi):
+    # before its time it is another plant; a time event of the one for model exchange changes nothing
+    early = {"rates": "d[0] = ((t < 1000 ? 9 : 2) * u[0] - x[0]) / 100", "begin": "next = 1234"}
+    path = plant(tmp_path, kind=kind, fmi=fmi, starts=1000.0, **(LAG | early))
+    assert off(found(path), EXACT) < CLOSE
+
+
+@pytest.mark.parametrize("size", [1e-12, 1e-20])
+def test_states_far_below_their_nominal_values_are_integrated_as_well(tmp_path, size):
+    small = {"states": 2, "rates": f"d[0] = ({size} * u[0] - x[0]) / 100; d[1] = (x[0] - x[1]) / 30"}
+    got = found(plant(tmp_path, kind="ModelExchange", outputs="y[0] = x[1]", **small))
+    exact = size * (1 - (100 * np.exp(-T / 100) - 30 * np.exp(-T / 30)) / 70)
+    assert off(got, exact) < CLOSE
+    assert got.verdicts[0].verdict == "good"
+
+
+def test_a_state_that_is_rounding_does_not_hold_up_the_solver(tmp_path):
+    rates = "d[0] = (2 * u[0] - x[0]) / 100; d[1] = (0.1 + 0.2 - 0.3) * sin(1e6 * t)"
+    got = found(plant(tmp_path, kind="ModelExchange", states=2, rates=rates, outputs="y[0] = x[0] + x[1]"))
+    assert off(got, EXACT) < CLOSE
+
+
+@pytest.mark.parametrize("attributes", ["", 'canHandleVariableCommunicationStepSize="true"'])
+def test_steps_of_a_microsecond_in_a_default_experiment_are_taken_together(tmp_path, attributes):
+    exact = {"tick": "x[0] += (2 * u[0] - x[0]) * -expm1(-h / 100)", "outputs": "y[0] = x[0]"}  # at any step
+    path = make_plant(tmp_path, [U, Y], step=1e-6, units=("%", "m"), attributes=attributes, **exact)
+    assert off(found(path, samples=5, settle=0.0), EXACT[:5]) < CLOSE
+    with FmuPlant(path, ["u"], ["y"], dt=1e-5) as fast:
+        assert fast.substep == pytest.approx(1e-6)
+
+
+def test_a_plant_of_microseconds_is_found(tmp_path):
+    for kind in ("CoSimulation", "ModelExchange"):
+        fast = LAG | {"rates": "d[0] = (2 * u[0] - x[0]) / 1e-5"}
+        if kind == "CoSimulation":  # exactly, for its solver has steps of its own
+            fast = {"tick": "x[0] += (2 * u[0] - x[0]) * -expm1(-0.1)", "outputs": "y[0] = x[0]"}
+        path = make_plant(tmp_path / kind, [U, Y], kind, step=1e-6, units=("%", "m"), **fast)
+        got = identify_fmu(path, {"u": (None, 1.0)}, ["y"], 1e-6, N)
+        assert off(got, 2 * (1 - np.exp(-0.1 * np.arange(1, N + 1)))) < CLOSE
+
+
 @pytest.mark.parametrize(
     ("code", "exact"),
     [(LAG | {"initial": "x[0] = 100"}, EXACT), ({"rates": "d[0] = u[0] - 50", "outputs": "y[0] = x[0]"}, T)],
@@ -127,6 +172,42 @@ def test_at_a_limit_steps_go_the_way_that_is_left(tmp_path, at, way):
     assert off(got, EXACT) < CLOSE
     assert any(f"stepped {way} only from {at}" in note for note in got.notes)
     assert set(got.alternatives) == {way, f"half {way}"}
+
+
+PLAY = {
+    "states": 1,
+    "initial": "memory[0] = 50",
+    "rates": "d[0] = (2 * memory[0] - x[0]) / 100",
+    "outputs": "y[0] = x[0]",
+    "tick": "if (fabs(u[0] - memory[0]) > PLAY) { memory[0] = u[0] - (u[0] > memory[0] ? PLAY : -PLAY); }",
+}
+
+
+@pytest.mark.parametrize(("play", "verdict"), [(0.01, "look"), (0.1, "bad")])
+def test_backlash_within_the_step_is_seen_on_the_way_back(tmp_path, play, verdict):
+    code = PLAY | {"tick": PLAY["tick"].replace("PLAY", str(play))}
+    row = found(plant(tmp_path, **code)).verdicts[0]
+    assert row.verdict == verdict
+    stays = re.search(r"([\d.]+) % of it stays when u has gone back", row.says)
+    # half a step of 0.5 moves it by 0.5 - play, and back by all but play; what still moves is taken off
+    assert stays
+    assert float(stays[1]) == pytest.approx(100 * play / (0.5 - play), rel=0.25)
+
+
+@pytest.mark.parametrize(
+    ("offset", "verdict"), [(1e4, "good"), (1e6, "look"), (1e7, "bad")], ids=["fine", "coarse", "too coarse"]
+)
+def test_a_cv_in_single_precision_is_not_trusted_beyond_its_resolution(tmp_path, offset, verdict):
+    got = found(plant(tmp_path, **(LAG | {"outputs": f"y[0] = (float)(x[0] + {offset})"})))
+    row = got.verdicts[0]
+    assert row.verdict == verdict
+    assert ("moves in steps of" in row.says) == (verdict != "good")
+    if verdict == "good":
+        assert off(got, EXACT) < 1e-3  # half of 2^-10 on 2
+
+
+def test_a_cv_that_follows_at_once_is_not_taken_for_one_that_moves_in_steps(tmp_path):
+    assert found(plant(tmp_path, outputs="y[0] = 2 * u[0]")).verdicts[0].verdict == "good"
 
 
 def test_noise_is_averaged_and_what_it_leaves_is_told(tmp_path):
@@ -161,11 +242,16 @@ def test_noise_is_averaged_and_what_it_leaves_is_told(tmp_path):
         ({"rates": "d[0] = (2 * u[0] - x[0]) / 1000"}, "look", "not settled by sample 60"),
         ({"rates": "d[0] = 0.01 * (x[0] + u[0] - 50)"}, "bad", "it is unstable"),
         ({"rates": "d[0] = -x[0]"}, "none", "no response"),
+        ({"rates": "d[0] = x[1]; d[1] = 0.01 * (u[0] - 50 - x[0]) - 0.003 * x[1]"}, "look", "it still swings at sample 60"),
+        ({"rates": "d[0] = x[1]; d[1] = 0.01 * (u[0] - 50 - x[0]) + 0.003 * x[1]"}, "bad", "it swings ever more"),
     ],
-    ids=["asymmetric", "turns", "curved", "integrator", "drifting integrator", "slow", "unstable", "none"],
+    ids=[
+        *("asymmetric", "turns", "curved", "integrator", "drifting integrator", "slow", "unstable", "none"),
+        *("swings", "swings ever more"),
+    ],
 )  # fmt: skip
 def test_a_pair_that_is_not_simply_linear_says_so(tmp_path, code, verdict, says):
-    path = plant(tmp_path, states=1, outputs="y[0] = x[0]", **code)
+    path = plant(tmp_path, states=2, outputs="y[0] = x[0]", **code)
     row = found(path, {"u": (None, 10.0)}).verdicts[0]
     assert (row.verdict, says in row.says) == (verdict, True), row
 
@@ -214,6 +300,13 @@ def test_an_output_of_whole_values_is_to_be_looked_at(tmp_path):
     row = found(path, {"u": (None, 5.0)}, ("alarm",)).verdicts[0]
     assert row.verdict in ("look", "bad")
     assert "whole values only" in row.says
+
+
+def test_an_fmu_that_ends_after_its_tests_is_identified_without_the_way_back(tmp_path):
+    code = LAG | {"initial": "x[0] = 100", "tick": "if (t > 900) { return 3; }"}
+    got = found(plant(tmp_path, **code))
+    assert off(got, EXACT) < CLOSE
+    assert got.verdicts[0].verdict == "good"
 
 
 def test_every_test_is_a_record_and_those_of_half_size_were_left_out(tmp_path):
@@ -360,6 +453,7 @@ def test_a_sweep_gives_a_gain_schedule_and_its_map(tmp_path, capsys):
     np.testing.assert_allclose(np.asarray(schedule.coefficients)[:, 0, 0, -1], [0.8, 2.0, 3.2], rtol=1e-6)
     told = capsys.readouterr().out
     assert "gain of u on y at u = 20: 0.8; u = 50: 2; u = 80: 3.2" in told
+    assert "at u = 80, u on y is good: gain 3.2 m per %, dead time 0 s, settled after 80 s" in told
     assert "u = 80: 3.2" in (tmp_path / "model.html").read_text()
     with pytest.raises(InputError, match="one of the MVs u"):
         identify_fmu_schedule(tmp_path / "plant.fmu", {"u": (None, None)}, ["y"], DT, N, {"w": [1.0, 2.0]})

@@ -202,6 +202,20 @@ def test_a_table_of_transfer_functions_is_sampled_exactly(tmp_path):
     assert abs(found[0, -1] - 2.5) < 2.5e-3, "until all but a thousandth has come"
 
 
+@pytest.mark.parametrize(("unit", "asked"), [("min", "s"), ("s", "min"), ("days", "s"), ("Hours", "h")])
+def test_times_in_other_units_than_asked_for_are_refused(tmp_path, unit, asked):
+    path = tmp_path / "table.csv"
+    path.write_text(f"cv,mv,gain,dead time [{unit}],time constant\ny,u,2,3,10\n")
+    wanted = Asked(dt=60.0, samples=20, time_unit=asked, dvs=())
+    if unit.lower().startswith(asked):
+        assert import_model([path], "", wanted)[1][0].samples == 20
+        return
+    with pytest.raises(
+        InputError, match=rf"table.csv:1: got 'dead time \[{unit}\]', expected times in {asked}"
+    ):
+        import_model([path], "", wanted)
+
+
 def test_minutes_integrators_and_unknown_columns_are_said(tmp_path):
     (tmp_path / "t.csv").write_text(
         "cv,mv,gain,tau,integrating,remark,cv_unit\nlevel,valve,0.6,0,yes,look,cm\nflow,valve,2,3,,,\n"

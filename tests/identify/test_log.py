@@ -48,14 +48,57 @@ MOMENTS = [START + datetime.timedelta(seconds=10 * k) for k in range(COUNT)]
         [m.strftime("%d-%b-%y %H:%M:%S") for m in MOMENTS],
         [m.timestamp() for m in MOMENTS],
         [int(m.timestamp() * 1000) for m in MOMENTS],
+        [m.strftime("%H:%M:%S") for m in MOMENTS],
+        [m.strftime("%I:%M:%S.00 %p") for m in MOMENTS],
+        [f"{45350 + k * 10 / 86400:.8f}" for k in range(COUNT)],
     ],
-    ids=["ISO", "offset", "day first", "month first", "month by name", "epoch", "milliseconds"],
+    ids=[
+        *("ISO", "offset", "day first", "month first", "month by name", "epoch", "milliseconds"),
+        *("time of day", "time of day in halves", "days of a spreadsheet"),
+    ],
 )
 def test_times_are_read_in_the_usual_forms(tmp_path, times):
     log = read_log(written(tmp_path, rows(times)), ["u", "y"], held=["u"])
     assert log.dt == 10.0
     np.testing.assert_allclose(log.times, 10.0 * np.arange(COUNT), atol=1e-6)
     assert log.begin == str(times[0])
+
+
+def test_a_date_and_a_time_of_day_in_two_columns_are_one_time(tmp_path):
+    lines = ["date,time,u,y", *(f"{m:%d.%m.%Y},{m:%H:%M:%S},{k},{2 * k}" for k, m in enumerate(MOMENTS))]
+    log = read_log(written(tmp_path, lines), ["u", "y"], held=["u"])
+    np.testing.assert_array_equal(log.times, 10.0 * np.arange(COUNT))
+    assert any("date and time together" in note for note in log.notes)
+
+
+@pytest.mark.parametrize(("end", "mark"), [("\r", ","), ("\r\n", "\t"), ("\n", "|")])
+def test_every_end_of_line_and_separator_is_read(tmp_path, end, mark):
+    path = tmp_path / "log.csv"
+    path.write_bytes(("\ufeff" + end.join(rows([10 * k for k in range(COUNT)], separator=mark))).encode())
+    log = read_log(path, ["u", "y"], held=["u"])
+    np.testing.assert_array_equal(log.values["y"], 2.0 * np.arange(COUNT))
+
+
+@pytest.mark.parametrize("words", [("OFF", "ON"), ("false", "true"), ("Closed", "Open"), ("no", "YES")])
+def test_a_column_of_two_words_is_zero_and_one(tmp_path, words):
+    u = [words[k // 7 % 2] if k != 11 else "Bad" for k in range(COUNT)]
+    log = read_log(written(tmp_path, rows([10 * k for k in range(COUNT)], u)), ["u", "y"], held=["u"])
+    np.testing.assert_array_equal(log.values["u"], [k // 7 % 2 for k in range(COUNT)])
+    assert any(f"u: {words[1].lower()} was taken for 1" in note for note in log.notes)
+    mixed = written(tmp_path, rows([10 * k for k in range(COUNT)], [*range(COUNT - 1), words[0]]))
+    with pytest.raises(InputError, match=f"column u, row {COUNT + 1}: got '{words[0]}'"):
+        read_log(mixed, ["u", "y"])
+
+
+def test_numbers_that_stand_for_no_value_are_missing(tmp_path):
+    y = [-9999 if 10 < k < 15 else 2 + 0.1 * k for k in range(COUNT)]
+    log = read_log(written(tmp_path, rows([10 * k for k in range(COUNT)], y=y)), ["u", "y"], held=["u"])
+    assert np.flatnonzero(np.isnan(log.values["y"])).tolist() == [11, 12, 13, 14]
+    near = [-9999 + 100 * k for k in range(COUNT)]
+    assert (
+        read_log(written(tmp_path, rows([10 * k for k in range(COUNT)], y=near)), ["u", "y"]).quality["y"]
+        == 1
+    )
 
 
 def test_a_date_that_may_be_read_in_two_ways_is_refused(tmp_path):

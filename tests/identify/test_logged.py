@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from figures.identification import write_page
+from identify.logged import fit as fit_module
 from identify.logged import identify_log
-from identify.logged.fit import bands, fitted, make_data, search, simulated
+from identify.logged.fit import bands, chosen, fitted, make_data, search, simulated
 from identify.logged.kernel import Posterior, estimate, factors
 from identify.logged.low_order import low_order
-from identify.logged.noise import Noise, likeliest, whitened
+from identify.logged.noise import WALK, Noise, likeliest, whitened
 from identify.logged.regression import Segment, sums
 from jaxmpc.cli import main as cli
 from jaxmpc.errors import InputError
@@ -127,7 +128,7 @@ def test_the_posterior_is_that_of_conditioning_all_data_at_once():
 
 
 def test_the_factor_of_a_kernel_is_that_of_its_covariance():
-    low = np.asarray(factors(np.array([[0.5, np.log(3.0), np.log(7.0)]]), 9))[0]
+    low = np.asarray(factors(np.array([[0.5, np.log(3.0), np.log(7.0)]]), np.arange(9.0)))[0]
     lag = np.arange(1, 10)
     covariance = np.exp(0.5 - (lag[:, None] + lag) / 6.0 - np.abs(lag[:, None] - lag) / 7.0)
     np.testing.assert_allclose(low @ low.T, covariance, rtol=1e-12)
@@ -313,6 +314,21 @@ def test_the_evidence_of_a_fit_does_not_depend_on_the_order_of_its_inputs(moves)
     assert other.posterior.score == pytest.approx(start.posterior.score, rel=1e-9)
 
 
+def test_unseen_samples_overrule_a_likely_fit_that_foresees_them_far_worse(moves, monkeypatch):
+    y = response(FIRST, moves[:, 0]) + 0.1 * np.random.default_rng(4).normal(size=COUNT)
+    data, cut = make_data(y, moves[:, :1], [slice(0, COUNT)]), round(0.73 * COUNT)
+    right, overruled = chosen(data, LENGTH, cut)
+    assert not overruled
+    posterior = dataclasses.replace(right.posterior, mean=-right.posterior.mean)
+    wrong = dataclasses.replace(
+        right, posterior=posterior, noise=WALK
+    )  # as one sample ahead may make it look
+    monkeypatch.setattr(fit_module, "search", lambda *_: wrong)
+    found, overruled = chosen(data, LENGTH, cut)
+    assert overruled
+    np.testing.assert_allclose(found.steps(data)[0], coefficients(FIRST), atol=0.1)
+
+
 def test_the_command_writes_a_model_and_a_page_and_refuses_what_is_for_fmus(tmp_path, moves, capsys):
     rng = np.random.default_rng(9)
     y = response(FIRST, moves[:, 0]) + response(SECOND, moves[:, 1]) + 0.1 * rng.normal(size=COUNT)
@@ -331,6 +347,63 @@ def test_the_command_writes_a_model_and_a_page_and_refuses_what_is_for_fmus(tmp_
         assert cli.main([*words, *wrong, "--out", str(out)]) == 2
         assert wrong[0] in capsys.readouterr().err
     assert not out.exists()
+
+
+PROCESS = """
+name = "own"
+dt = 1
+cv = [{ name = "level", unit = "m", tag = "y" }]
+mv = [{ name = "valve", unit = "%", tag = "a", low = 0, high = 100 }]
+disturbance = [{ name = "feed", unit = "t/h", tag = "b" }]
+
+[model]
+samples = 20
+working_point = { level = 2, valve = 50 }
+transfer_functions = [{ cv = "level", mv = "valve", gain = 1, time_constants = [3] }]
+
+[structure]
+prediction_horizon = 16
+control_horizon = 4
+blocks = [1, 1, 2]
+
+[presets.default]
+cv_weight = { level = 1 }
+move_weight = { valve = 0.001 }
+
+[references.day]
+duration = 1500
+windows = [[0, 2]]
+"""
+
+
+def test_the_command_takes_names_and_tags_of_a_process(tmp_path, moves):
+    y = response(FIRST, moves[:, 0]) + response(SECOND, moves[:, 1])
+    y = y + 0.1 * np.random.default_rng(9).normal(size=COUNT)
+    path, out = log_file(tmp_path / "log.csv", moves, y), tmp_path / "made.json"
+    process = tmp_path / "own.toml"
+    process.write_text(PROCESS)
+    words = ["identify", str(path), "--process", str(process), "--dv", "b", "--samples", str(LENGTH)]
+    assert cli.main([*words, "--out", str(out)]) == 0
+    model = StepResponseModel.load(out)
+    assert (model.cv_names, model.mv_names, model.dv_names) == (("level",), ("valve",), ("feed",))
+    assert (model.cv_units, model.mv_units, model.dv_units) == (("m",), ("%",), ("t/h",))
+
+
+def test_a_response_longer_than_can_be_fitted_is_sampled_more_coarsely(tmp_path):
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.normal(size=12), 500)
+    y, x = np.zeros(len(u)), 0.0
+    for k in range(len(u)):
+        y[k] = x
+        x += (2 * u[k] - x) / 200
+    path = log_file(tmp_path / "log.csv", u[:, None], y + 0.02 * rng.normal(size=len(u)))
+    found = identify_log(path, ["a"], ["y"])
+    dt = found.model.dt
+    exact = 2 * (1 - np.exp(-dt * np.arange(1, found.model.samples + 1) / 200))
+    assert dt > 1
+    assert found.verdicts[0].verdict == "good"
+    assert np.abs(found.responses[0, 0] - exact).max() < found.bands[0, 0].max() < 0.15
+    assert any("were made one" in note for note in found.notes)
 
 
 def test_a_cv_with_hardly_any_value_is_refused(tmp_path, moves):

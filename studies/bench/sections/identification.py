@@ -1,21 +1,23 @@
-"""Step responses from noisy data whose truth is known: ours beside the FIR and ARX models of SIPPY."""
+"""Step responses from noisy data whose truth is known, and from published data: ours beside FIR and ARX models of SIPPY."""
 
 from __future__ import annotations
 
 import importlib
 import importlib.util
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 from scipy.signal import lfilter
 
-from identify.logged.fit import make_data, search
+from identify.logged.fit import chosen, fitted, make_data
+from identify.logged.identify import HELD_OUT
 from jaxmpc.model.transfer_function import TransferFunction
 from studies.bench.context import Context
 from studies.bench.rows import Row, timed
+from studies.bench.sections.published import Method, published
 
 LENGTH, COUNT = 60, 1200  # N; samples of 1 min
 ORDER = 4  # of ARX
@@ -24,29 +26,31 @@ WOOD_BERRY = (  # Wood & Berry 1973: the top of a methanol column by reflux and 
     TransferFunction(-18.9, (21.0,), 3.0),
 )
 Signals = Float[np.ndarray, "sample input"]
-Method = Callable[[Float[np.ndarray, " sample"], Signals], Float[np.ndarray, "input n"]]
 
 
 def identification(context: Context) -> Iterator[Row]:
     """Rows ``identification, DATA: METHOD``; the error is of the worst coefficient over the largest of its response."""
+    installed = importlib.util.find_spec("sippy_unipi") is not None
+    methods = {name: method if installed or method is _kernel else None for name, method in METHODS.items()}
     for kind in ("Wood-Berry, drift", "random, white noise", "random, drift"):
         logs = [_log(kind, seed) for seed in range(context.size.identified)]
         context.say(f"identification, {kind}")
-        for name, method in METHODS.items():
+        for name, method in methods.items():
             row = f"identification, {kind}: {name}"
-            if method is not _kernel and importlib.util.find_spec("sippy_unipi") is None:
+            if method is None:
                 yield Row(name=row, status="missing", note="pip install 'jaxmpc[bench]'")
                 continue
             times, errors = [], []
             for truth, y, u in logs:
                 begin = time.perf_counter()
-                found = method(y, u)
+                found = method(y, u, LENGTH)
                 times.append(time.perf_counter() - begin)
                 errors.append(float((np.abs(found - truth).max(axis=1) / np.abs(truth).max(axis=1)).max()))
             note = (
                 f"error of the worst coefficient, median {np.median(errors):.2g}; {COUNT} samples, N {LENGTH}"
             )
             yield timed(row, times, errors, solved=None, counts=True, note=note)
+    yield from published(context, methods)
 
 
 def _log(kind: str, seed: int) -> tuple[Float[np.ndarray, "input n"], Float[np.ndarray, " sample"], Signals]:
@@ -72,20 +76,21 @@ def _random(rng: np.random.Generator) -> TransferFunction:
     )
 
 
-def _kernel(y: np.ndarray, u: Signals) -> Float[np.ndarray, "input n"]:
-    data = make_data(y, u, [slice(0, COUNT)])
-    return search(data, LENGTH).steps(data)
+def _kernel(y: np.ndarray, u: Signals, length: int) -> Float[np.ndarray, "input n"]:
+    data = make_data(y, u, [slice(0, len(y))])
+    trained, _ = chosen(data, length, round((1 - HELD_OUT) * len(y)))
+    return fitted(data, length, trained, 30).steps(data)
 
 
 def _sippy(kind: Literal["FIR", "ARX"]) -> Method:
     """Least squares by SIPPY: of a finite impulse response, or of an ARX model whose lags cover dead times up to 8."""
 
-    def method(y: np.ndarray, u: Signals) -> Float[np.ndarray, "input n"]:
+    def method(y: np.ndarray, u: Signals, length: int) -> Float[np.ndarray, "input n"]:
         identify = importlib.import_module("sippy_unipi").system_identification
-        orders: dict[str, Any] = {"FIR_orders": [LENGTH, 0], "ARX_orders": [ORDER, ORDER + 8, 0]}
+        orders: dict[str, Any] = {"FIR_orders": [length, 0], "ARX_orders": [ORDER, ORDER + 8, 0]}
         signals = (y - y.mean())[None], (u - u.mean(axis=0)).T
         found = identify(*signals, kind, **{f"{kind}_orders": orders[f"{kind}_orders"]})
-        pulse = np.eye(1, LENGTH + 1)[0]
+        pulse = np.eye(1, length + 1)[0]
         of_inputs = zip(found.NUMERATOR[0], found.DENOMINATOR[0], strict=True)
         responses = [lfilter([0.0, *numerator], denominator, pulse) for numerator, denominator in of_inputs]
         return np.cumsum(responses, axis=1)[:, 1:]
