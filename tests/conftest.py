@@ -1,6 +1,8 @@
 """Shared fixtures. Importing the package switches JAX to float64 and turns on the compilation cache."""
 
+import gc
 import os
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -14,13 +16,21 @@ from jaxmpc.problem.tuning import make_tuning
 os.environ["JAXMPC_QUIET"] = (
     "1"  # what a test compiles depends on the tests before it; `test_compilation` listens
 )
+# for the workers and all that tests start, which share the cores: threads that wait for each other in NumPy keep them busy
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+MAPS = Path("/proc/self/maps")
+MOST_MAPS = 20_000  # of the 65,530 that a process may have, so that the largest modules still fit
+
+# programs are traced by the thousand, and what they are traced to lives on: looking for garbage in it takes a twentieth
+gc.set_threshold(20_000, 20, 20)
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _forget_compiled_programs():
-    """Every compiled program holds hundreds of memory maps, and a process may have 65,530 of them."""
+    """Before memory maps run out, of which a program holds hundreds; until then the next module may use the same."""
     yield
-    jax.clear_caches()
+    if not MAPS.exists() or MAPS.read_bytes().count(b"\n") > MOST_MAPS:
+        jax.clear_caches()
 
 
 def second_order(gain, slow, fast, zero, samples, dt=10.0):

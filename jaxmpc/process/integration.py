@@ -30,16 +30,15 @@ def whole_steps(dt: Any, substep: Any) -> int:
 def runge_kutta(slope: Callable[[tuple], Any], x: tuple, steps, substep: float) -> tuple:
     """Integrate ``dx/dt = slope(x)`` over `steps` classical fourth-order Runge-Kutta steps of `substep` seconds."""
 
-    def ahead(x, k, h):
-        return tuple(a + h * b for a, b in zip(x, k, strict=True))
-
     def one(_, x):
-        k1 = slope(x)
-        k2 = slope(ahead(x, k1, 0.5 * substep))
-        k3 = slope(ahead(x, k2, 0.5 * substep))
-        k4 = slope(ahead(x, k3, substep))
-        total = (a + 2 * (b + c) + d for a, b, c, d in zip(k1, k2, k3, k4, strict=True))
-        return tuple(a + substep / 6 * k for a, k in zip(x, total, strict=True))
+        # the stages are a loop, so that a program holds the slope once
+        def stage(i, k):
+            h = jnp.asarray([0.0, 0.5 * substep, 0.5 * substep, substep])[i]
+            ahead = tuple(a + h * b[jnp.maximum(i - 1, 0)] for a, b in zip(x, k, strict=True))
+            return tuple(b.at[i].set(new) for b, new in zip(k, slope(ahead), strict=True))
+
+        k = jax.lax.fori_loop(0, 4, stage, tuple(jnp.zeros((4, *jnp.shape(a))) for a in x))
+        return tuple(a + substep / 6 * (b[0] + 2 * (b[1] + b[2]) + b[3]) for a, b in zip(x, k, strict=True))
 
     return jax.lax.fori_loop(0, steps, one, x)
 

@@ -188,30 +188,29 @@ class _Proximal(NamedTuple):
 
     def _limits(self, point: _Point, old: _Families) -> Float[Array, " limit"]:
         """Prices of the CV limits: what sigma t + price exceeds sigma (limit + eps) by, with the best eps."""
-        p, beyond = self.problem, self._outside(point, old)
-        ones = np.ones(beyond.shape[0] // p.slack_price.shape[0])
+        p = self.problem
+        beyond = p.by_cv(self._outside(point, old))
+        ones = np.ones(beyond.shape[1])
 
-        def affordable(
-            beyond,
-        ):  # the same less a level per CV, sigma eps, above which they add up to the price of eps
+        def project():
+            both = jnp.maximum(jnp.stack([beyond, -beyond]), 0.0)
+
+            # a level per side and CV, sigma eps, above which they add up to the price of eps
             def rise(levels):
                 _, level = levels
-                above = beyond > level[:, None]
-                sum_, number = jnp.where(above, beyond, 0.0) @ ones, above.astype(level.dtype) @ ones
+                above = both > level[..., None]
+                sum_, number = jnp.where(above, both, 0.0) @ ones, above.astype(level.dtype) @ ones
                 return level, jnp.maximum(level, (sum_ - p.slack_price) / jnp.maximum(number, 1.0))
 
-            start = jnp.zeros(p.slack_price.shape)
+            start = jnp.zeros((2, len(p.slack_price)))
             _, level = jax.lax.while_loop(
                 lambda levels: jnp.any(levels[1] > levels[0]), rise, (start - 1.0, start)
             )
-            return jnp.maximum(beyond - level[:, None], 0.0).reshape(-1)
+            high, low = jnp.maximum(both - level[..., None], 0.0)
+            return high - low
 
-        def project():
-            by_cv = p.by_cv(beyond)
-            return affordable(jnp.maximum(by_cv, 0.0)) - affordable(jnp.maximum(-by_cv, 0.0))
-
-        within = jnp.all(p.by_cv(jnp.abs(beyond)) @ ones <= p.slack_price)
-        return jax.lax.cond(within, lambda: beyond, project)
+        within = jnp.all(jnp.abs(beyond) @ ones <= p.slack_price)
+        return jax.lax.cond(within, lambda: beyond, project).reshape(-1)
 
     def slopes(self, point: _Point, old: _Families, new: _Families) -> Slopes:
         """Derivatives of the new prices."""
@@ -319,7 +318,7 @@ def _solved(p: Prepared, x: Float[Array, " n"], prices: _Families, most: Float[A
         direction = _Point(dx, p.respond(dx), p.qp.rows.of(dx))
         bend, slope = dx @ (p.hessian @ dx), (p.hessian @ point.x + p.linear) @ dx
 
-        def along(alpha):  # derivative of the merit along the direction, increasing in alpha
+        def along(alpha):  # derivative of the merit along the direction, increasing in alpha; and the prices
             new = proximal.prices(moved(point, direction, alpha), state.prices)
             change = (
                 slope
@@ -327,11 +326,10 @@ def _solved(p: Prepared, x: Float[Array, " n"], prices: _Families, most: Float[A
                 + total(proximal.net(new) * direction.t)
                 + proximal.pushed(new) @ direction.w
             )
-            return change + (new.box + jnp.sum(new.envelope, axis=0)) @ dx
+            return change + (new.box + jnp.sum(new.envelope, axis=0)) @ dx, new
 
-        alpha = _search(along, gradient @ way)
+        alpha, prices = _search(along, gradient @ way, prices)
         point = moved(point, direction, alpha)
-        prices = proximal.prices(point, state.prices)
         force = proximal.gradient(point.x, prices)
         left = jnp.max(jnp.abs(force))
         # where there is next to nothing to gain, the gap has to be small against a small share of the unit
@@ -405,30 +403,42 @@ def _at(p: Prepared, x: Float[Array, " n"], prices: _Families) -> _State:
     )
 
 
-def _search(along, slope):
-    """Step length where the merit is nearly flat: 1, or what the secant method finds between 0 and 1."""
+def _search(along, slope, nothing: _Families) -> tuple[Array, _Families]:
+    """Step length where the merit is nearly flat: 1, or what the secant method finds between 0 and 1; and the prices there.
+
+    The loop tries 1 as well, so that a program holds the prices along a direction once.
+
+    Args:
+        along: the slope of the merit at a step length, and the prices there.
+        slope: at the start.
+        nothing: prices of any value.
+    """
 
     # one vector holds the bracket, so that a batch freezes its finished lanes with one operation
-    def closer(bracket):
-        low, high, at_low, at_high, _, _, tried = bracket
+    def closer(carry):
+        low, high, at_low, at_high, _, _, tried = carry[0]
+        first = tried < 0.0
         alpha = low - at_low * (high - low) / (at_high - at_low)
         alpha = jnp.where((alpha > low) & (alpha < high), alpha, 0.5 * (low + high))
-        value = along(alpha)
+        alpha = jnp.where(first, 1.0, alpha)
+        value, prices = along(alpha)
         # Illinois rule: the end that stays gets half its slope, so that both ends move
         left = jnp.stack([alpha, high, value, 0.5 * at_high, alpha, value, tried + 1.0])
-        right = jnp.stack([low, alpha, 0.5 * at_low, value, alpha, value, tried + 1.0])
-        return jnp.where(value > 0.0, right, left)
+        kept = jnp.where(first, at_low, 0.5 * at_low)
+        right = jnp.stack([low, alpha, kept, value, alpha, value, tried + 1.0])
+        return jnp.where(first | (value > 0.0), right, left), prices
 
-    def steep(bracket):
-        low, _, at_low, _, alpha, value, tried = bracket
+    def steep(carry):
+        low, _, at_low, _, alpha, value, tried = carry[0]
         size = jnp.abs(slope)
         # a full step may stop short of the minimum
         far = (tried > 0.0) & (value < -FLAT * size)
         # beyond a kink the merit may have risen: up to `low` its slope is at most `at_low`, from there on `value`
         downhill = low * at_low + (alpha - low) * value < 0.0
         good = ~far & ((value <= UPHILL * size) | (downhill & (value <= FLAT * size)))
-        return ~good & (tried <= SEARCHES)
+        return (tried < 0.0) | ~good & (tried <= SEARCHES)
 
-    at_one = along(1.0)
     zero, one = jnp.zeros(()), jnp.ones(())
-    return jax.lax.while_loop(steep, closer, jnp.stack([zero, one, slope, at_one, one, at_one, zero]))[4]
+    start = jnp.stack([zero, one, slope, zero, one, zero, -one])
+    bracket, prices = jax.lax.while_loop(steep, closer, (start, nothing))
+    return bracket[4], prices

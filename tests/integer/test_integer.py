@@ -324,7 +324,8 @@ INTEGERS = 8  # room for the six integer moves
 
 @pytest.fixture
 def searched():
-    """What the compiled search finds for one of `problems`; compiled after constants of it were changed."""
+    """What the compiled search finds for one of `problems`; compiled after constants of it were changed, and forgotten."""
+    jax.clear_caches()
     decide = jax.jit(lambda *arguments: compiled_search.decide(*arguments))
 
     def search(problem):
@@ -332,7 +333,8 @@ def searched():
         cold = jax.tree.map(lambda leaf: leaf[0], relaxer_of(constants).cold(one(instance)))
         return decide(constants.qp, constants.tables(INTEGERS), instance, cold, 1e-6)
 
-    return search
+    yield search
+    jax.clear_caches()
 
 
 @pytest.mark.parametrize("free", [compiled_lists.GRID_FREE, 0])
