@@ -5,7 +5,6 @@ The host reads `Constants`, the compiled search the arrays of `Tables`, padded t
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import equinox as eqx
@@ -105,12 +104,13 @@ class Constants:
         counts = [moves_per_block(structure, mv)[:count] for mv, count in whole]
         self.counts = np.concatenate([*counts, []]).astype(int)  # samples that carry each of them
         self.reached = self._before(self.block[:, None] >= self.block[None, :]) * self.counts
+        self._chord_weight: Float[np.ndarray, " position"] | None = None
 
     def _before(self, related: Bool[np.ndarray, "integer integer"]) -> Float[np.ndarray, "integer integer"]:
         """Which pairs of integer moves are of one MV and related."""
         return (related & (self.mv[:, None] == self.mv[None, :])).astype(float)
 
-    @functools.cached_property
+    @property
     def chord_weight(self) -> Float[np.ndarray, " position"]:
         """Curvature of the positions that chords may pay (`tighten`), made when first needed."""
         found = self.chords_within(None)
@@ -119,13 +119,10 @@ class Constants:
 
     def chords_within(self, seconds: float | None) -> Float[np.ndarray, " position"] | None:
         """`chord_weight` if it is known or made in so many seconds (None for no limit), else None."""
-        if "chord_weight" not in self.__dict__:
+        if self._chord_weight is None:
             back = np.linalg.inv(self.reached)
-            found = chord_weights(back.T @ self.schur @ back, seconds)
-            if found is None:
-                return None
-            self.__dict__["chord_weight"] = found
-        return self.chord_weight
+            self._chord_weight = chord_weights(back.T @ self.schur @ back, seconds)
+        return self._chord_weight
 
     def of_chords(self, price: np.ndarray, at: np.ndarray) -> tuple[float, np.ndarray]:
         """What prices of chords add to a lower bound with all curvature: its value and its gradient at moves.
