@@ -10,7 +10,6 @@ import datetime
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -20,21 +19,21 @@ from identify.logged.fit import (
     Fit,
     bands,
     chosen,
-    climbing,
     fitted,
     make_data,
     residuals,
     search,
     simulated,
 )
-from identify.logged.judge import excitations, verdict_of
+from identify.logged.judge import excitations
 from identify.logged.log import LEAST, Log, read_log
 from identify.logged.low_order import LowOrder, low_order
 from identify.logged.noise import innovations
-from identify.logged.residuals import Residuals, examined
+from identify.logged.residuals import examined
+from identify.logged.told import CvResult, advice, method_notes, pair_verdict
 from jaxmpc.check import is_count
 from jaxmpc.errors import InputError
-from jaxmpc.model.identification import Identification, PairVerdict, Record
+from jaxmpc.model.identification import Identification, Record
 from jaxmpc.model.step_response import make_model
 
 HELD_OUT = 0.27  # share of the samples that the first fit does not see
@@ -43,24 +42,6 @@ ROOM = 0.7  # of the lags of a first fit, in which it settles
 COARSER = 4  # times the interval where responses do not settle within COLUMNS
 MARGIN, SHORTEST = 1.25, 10  # N over the settling time of the first fit; least N
 SETTLED, LAGS = 0.003, 5.8  # of the largest coefficient: settled; so many lags of a first order
-SPREAD = 6.9  # median deviations from 1 % to 99 % of a normal distribution
-CLOSED = 0.85  # correlation with what disturbs the CV from which on an input tells nothing of its own
-WHITE = 0.001  # probability below which residuals are not white
-
-
-class _Cv(NamedTuple):
-    """What was found for one CV, responses with all inputs, those that never move at 0."""
-
-    data: Data
-    final: Fit
-    fit: float  # % of the part that was left out
-    low_fit: float  # % by the low-order responses
-    low: list[LowOrder | None]
-    steps: np.ndarray  # "input n" [CV unit per input unit]
-    band: np.ndarray
-    predicted: np.ndarray  # " sample" [CV unit]
-    tested: Residuals
-    overruled: bool  # whether the part that was left out has decided against the likeliest noise
 
 
 def identify_log(
@@ -118,19 +99,21 @@ def identify_log(
         }
     excited = excitations(inputs, [log.units.get(name, "") for name in inputs], signals, log.segments)
     verdicts = tuple(
-        _verdict(name, log, inputs[j], excited[j], found[name], j) for name in cv for j in range(len(inputs))
+        pair_verdict(name, log, inputs[j], excited[j], found[name], j)
+        for name in cv
+        for j in range(len(inputs))
     )
     if all(row.verdict == "bad" for row in verdicts):
         reasons = "; ".join(dict.fromkeys(row.says for row in verdicts))
         raise InputError("data", str(path), "moves that tell at least one response", reasons)
     silent = np.array([row.verdict == "none" for row in verdicts]).reshape(len(cv), len(inputs), 1)
     steps = np.where(silent, 0.0, np.stack([found[name].steps for name in cv]))
-    notes = [*log.notes, *notes, *_method_notes(log, found, inputs, samples, cut)]
+    notes = [*log.notes, *notes, *method_notes(log, found, inputs, samples, cut)]
     return Identification(
         _model(path, log, mv, cv, dv, steps, verdicts, notes),
         verdicts,
         tuple(notes),
-        _advice(verdicts, log, samples),
+        advice(verdicts, log, samples),
         np.stack([found[name].band for name in cv]),
         {"low order (first order and dead time)": _alternative(found, cv, samples)},
         (_record(path, log, cv, signals, found, cut),),
@@ -222,7 +205,9 @@ def _settled(data: Data, length: int) -> int:
     return min(length, int(np.ceil(slowest)))
 
 
-def _identified(data: Data, length: int, cut: int, signals: np.ndarray, moving: np.ndarray, bar: tqdm) -> _Cv:
+def _identified(
+    data: Data, length: int, cut: int, signals: np.ndarray, moving: np.ndarray, bar: tqdm
+) -> CvResult:
     training = data.until(cut)
     trained, overruled = chosen(data, length, cut)
     bar.update()
@@ -241,7 +226,7 @@ def _identified(data: Data, length: int, cut: int, signals: np.ndarray, moving: 
     ]
     tested = examined(errors, signals, data.segments, length)
     fits = _fit(data, alone, cut), _fit(data, whole(rough), cut)
-    return _Cv(data, final, *fits, low, steps, band, alone, tested, overruled)
+    return CvResult(data, final, *fits, low, steps, band, alone, tested, overruled)
 
 
 def _replaced(fit: Fit, data: Data, band: np.ndarray) -> Fit:
@@ -271,99 +256,6 @@ def _fit(data: Data, predicted: np.ndarray, cut: int) -> float:
     return 100 * (1 - np.sqrt(off / total)) if total > 0 else float("nan")
 
 
-def _verdict(cv: str, log: Log, name: str, excited, found: _Cv, j: int) -> PairVerdict:
-    doubts, tested = [], found.tested
-    s, unit = found.steps[j], log.units.get(cv, "")
-    if found.final.integrating and climbing(s[None])[0]:
-        slope = (s[-1] - s[-max(2, len(s) // 5)]) / (max(2, len(s) // 5) - 1) / log.dt
-        doubts.append(
-            f"integrates: still rises by {slope:.3g} {unit} per second at sample {len(s)}, where the model holds it"
-        )
-    elif _unsettled(s, found.band[j]):
-        doubts.append(f"has not settled by sample {len(s)}: more --samples, or a larger --dt")
-    if found.overruled:
-        doubts.append(f"depends on what is taken for noise of {cv}, which its inputs do not move linearly")
-    if tested.past[j] > tested.limit:
-        doubts.append(
-            f"residuals still follow moves of {name} (correlation {tested.past[j]:.2f}): slower or not linear"
-        )
-    if tested.feedback[j] > tested.limit:
-        doubts.append(f"{name} follows what disturbs {cv} (feedback, correlation {tested.feedback[j]:.2f})")
-    values = log.values[cv]
-    span = float(np.nanpercentile(values, 99) - np.nanpercentile(values, 1)) or float(
-        np.nanmax(values) - np.nanmin(values)
-    )
-    # a single large transient is not what the CV does in the log
-    usual = SPREAD * float(np.nanmedian(np.abs(values - np.nanmedian(values))))
-    row = verdict_of(cv, unit, min(span, usual or span), name, excited, s, found.band[j], doubts)
-    closed = tested.feedback[j] > max(CLOSED, tested.limit) and row.verdict in ("good", "look")
-    return row._replace(verdict="bad") if closed else row
-
-
-def _unsettled(steps: np.ndarray, band: np.ndarray) -> bool:
-    end = max(2, len(steps) // 10)
-    moved = abs(float(steps[-1] - steps[-end]))
-    return moved > 0.03 * np.abs(steps).max() and moved > 0.5 * float(np.nanmax(band))
-
-
-def _method_notes(
-    log: Log, found: dict[str, _Cv], inputs: Sequence[str], samples: int, cut: int
-) -> list[str]:
-    kept = len(log.times) - cut
-    notes = [
-        f"the first {cut} samples made a first model, which was judged on the last {kept}; then all made the model in the "
-        "file, and the predictions that are drawn are those of the first",
-        "before each segment the inputs were taken to have stood at their first values",
-    ]
-    for name, own in found.items():
-        if np.isnan(own.fit):
-            notes.append(
-                f"{name}: no input moves in the part that was left out, which therefore judges nothing"
-            )
-        else:
-            off = own.low_fit - own.fit
-            better = "as well" if abs(off) < 0.5 else "better" if off > 0 else "less well"
-            words = f"{name}: {own.fit:.1f} % of the part that was left out is predicted (its level is not: one offset was "
-            notes.append(
-                f"{words}fitted); first order and dead time predict it {better} ({own.low_fit:.1f} %)"
-            )
-        words = f"{name}: the noise is {own.final.noise}"
-        if own.final.free is not None:
-            words += "; segments do not begin at rest, so that a free response was fitted at each beginning"
-        notes.append(words)
-        if own.overruled:
-            notes.append(
-                f"{name}: with a drifting disturbance, likelier one sample ahead, the part that was left out is predicted "
-                "far worse; bands are too narrow"
-            )
-        p = own.tested.white
-        if p < WHITE:
-            notes.append(f"{name}: residuals are not white (p = {p:.1g}): bands may be too narrow")
-        fed = [j for j in range(len(inputs)) if own.tested.feedback[j] > own.tested.limit]
-        if fed:
-            names = ", ".join(inputs[j] for j in fed)
-            words = f"{name}: later moves of {names} follow its residuals: a controller or an operator closed the loop. "
-            notes.append(
-                f"{words}Feedback may bias the responses; moves that do not depend on the CV tell more"
-            )
-    return notes
-
-
-def _advice(verdicts: Sequence[PairVerdict], log: Log, samples: int) -> tuple[str, ...]:
-    out = []
-    bad = list(dict.fromkeys(row.input for row in verdicts if row.verdict == "bad"))
-    if bad:
-        length = samples * log.dt
-        out.append(
-            f"Step {', '.join(bad)}, one at a time, up and down, some steps held for {length:g} s, and identify again"
-        )
-    if any(row.verdict == "look" for row in verdicts):
-        out.append(
-            "Look at the responses with the verdict look, and at the predictions, before you use the model"
-        )
-    return tuple(out)
-
-
 def _model(path, log: Log, mv, cv, dv, steps: np.ndarray, verdicts, notes):
     units = lambda names: [log.units.get(name, "1") for name in names] if log.units else ()  # noqa: E731
     point = {name: float(np.round(np.nanmedian(log.values[name]), 12)) for name in (*mv, *cv)}
@@ -391,14 +283,14 @@ def _model(path, log: Log, mv, cv, dv, steps: np.ndarray, verdicts, notes):
     )
 
 
-def _alternative(found: dict[str, _Cv], cv: Sequence[str], samples: int) -> np.ndarray:
+def _alternative(found: dict[str, CvResult], cv: Sequence[str], samples: int) -> np.ndarray:
     return np.stack(
         [[low.response(samples) if low else np.zeros(samples) for low in found[name].low] for name in cv]
     )
 
 
 def _record(
-    path, log: Log, cv: Sequence[str], signals: np.ndarray, found: dict[str, _Cv], cut: int
+    path, log: Log, cv: Sequence[str], signals: np.ndarray, found: dict[str, CvResult], cut: int
 ) -> Record:
     measured = np.stack([log.values[name] for name in cv], axis=1)
     predicted = np.full_like(measured, np.nan)

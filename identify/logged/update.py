@@ -15,13 +15,14 @@ import numpy as np
 from tqdm import tqdm
 
 from identify.logged.fit import WIDER
-from identify.logged.identify import HELD_OUT, WHITE
+from identify.logged.identify import HELD_OUT
 from identify.logged.judge import GOOD, USABLE, excitations
 from identify.logged.knobs import GAIN, Case, Found, fit_knobs
 from identify.logged.log import Log, read_log
 from identify.logged.noise import innovations
 from identify.logged.residuals import Residuals, examined
 from identify.logged.tags import tags_of
+from identify.logged.told import WHITE
 from jaxmpc.errors import InputError
 from jaxmpc.model.identification import Identification, PairVerdict, Record, Verdict
 from jaxmpc.model.step_response import StepResponseModel, make_model
