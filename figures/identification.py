@@ -143,22 +143,21 @@ def _responses(found: Identification) -> str:
 def _record(found: Identification, record: Record, number: int) -> str:
     """Measured and predicted CVs above the inputs that move; what the model has not seen is shaded."""
     inputs, cvs = _channels(found)
+    moving = np.ptp(record.inputs, axis=0) > 0
+    shown = np.flatnonzero(moving if moving.any() else ~moving)
     every = -(-len(record.times) // POINTS)
     times, unit = _axis(record.times[::every])
-    drawn, axes = style.figure(len(cvs) + 1, row_height=1.5)
+    drawn, axes = style.figure(len(cvs) + len(shown), row_height=1.3)
     unseen = ~record.used[::every]
     for i, (cv, cv_unit) in enumerate(cvs):
         ax = axes[i]
         ax.plot(times, record.measured[::every, i], color=style.BLACK, label="measured")
         ax.plot(times, record.predicted[::every, i], color=style.ORANGE, linestyle="--", label="model alone")
         ax.set_ylabel(style.label(style.name_of(cv), cv_unit), fontsize=8)
-    moving = np.ptp(record.inputs, axis=0) > 0
-    for j in np.flatnonzero(moving if moving.any() else ~moving):
-        label = f"{inputs[j][0]} [{style.unit(inputs[j][1])}]"
-        axes[-1].plot(times, record.inputs[::every, j], drawstyle="steps-post", label=label)
-    axes[-1].set_ylabel("inputs", fontsize=8)
+    for ax, j in zip(axes[len(cvs) :], shown, strict=True):
+        ax.plot(times, record.inputs[::every, j], color=style.BLUE, drawstyle="steps-post")
+        ax.set_ylabel(style.label(style.name_of(inputs[j][0]), inputs[j][1]), fontsize=8)
     axes[-1].set_xlabel(f"time [{unit}]")
-    axes[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     axes[0].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     for ax in axes:
         for begin, end in _stretches(unseen):
