@@ -63,12 +63,12 @@ class Cv(Limited, frozen=True):
     """A controlled variable (``[[cv]]``); its limits are soft."""
 
     # half width around the setpoint in which it counts as settled; a fiftieth of the span, if not given [CV unit]
-    settled: float = 0.0
+    settled: float = None  # pyright: ignore[reportAssignmentType]
     setpoint_tag: str = ""  # what logs call its setpoint, if they have it
 
     def __post_init__(self):
         super().__post_init__()
-        settled = self.settled or self.span / 50
+        settled = self.span / 50 if self.settled is None else self.settled
         expected = f"a half width above 0 [{self.unit}]"
         require(settled > 0 and is_number(settled), "settled", settled, expected)
         msgspec.structs.force_setattr(self, "settled", settled)

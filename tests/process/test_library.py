@@ -261,6 +261,26 @@ def test_a_wrong_transfer_function_is_refused_with_its_path(change, field):
     assert error.value.field == f"model.transfer_functions[0].{field}"
 
 
+@pytest.mark.parametrize(
+    ("table", "change", "field"),
+    [
+        ("cv", {"settled": 0}, "settled"),
+        ("cv", {"settled": math.inf}, "settled"),
+        ("cv", {"span": 0}, "span"),
+        ("cv", {"low": 70, "high": 50}, "low"),
+        ("mv", {"high": math.nan}, "high"),
+        ("mv", {"smallest_move": -1}, "smallest_move"),
+        ("mv", {"move": 0}, "move"),
+    ],
+)
+def test_a_number_that_a_variable_cannot_have_is_refused_with_its_path(table, change, field):
+    body = written()
+    body[table][0] |= change
+    with pytest.raises(InputError) as error:
+        process_of(body)
+    assert error.value.field == f"{table}[0].{field}"
+
+
 @pytest.mark.parametrize("samples", [0, 20_001, 1e9])
 def test_a_model_of_no_or_too_many_samples_is_refused(samples):
     body = written()
