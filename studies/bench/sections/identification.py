@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import time
 from collections.abc import Iterator
 from typing import Any, Literal
 
@@ -16,8 +15,8 @@ from identify.logged.fit import chosen, fitted, make_data
 from identify.logged.identify import HELD_OUT
 from jaxmpc.model.transfer_function import TransferFunction
 from studies.bench.context import Context
-from studies.bench.rows import Row, timed
-from studies.bench.sections.published import Method, published
+from studies.bench.rows import Row
+from studies.bench.sections.published import Method, compared, published
 
 LENGTH, COUNT = 60, 1200  # N; samples of 1 min
 ORDER = 4  # of ARX
@@ -35,21 +34,18 @@ def identification(context: Context) -> Iterator[Row]:
     for kind in ("Wood-Berry, drift", "random, white noise", "random, drift"):
         logs = [_log(kind, seed) for seed in range(context.size.identified)]
         context.say(f"identification, {kind}")
-        for name, method in methods.items():
-            row = f"identification, {kind}: {name}"
-            if method is None:
-                yield Row(name=row, status="missing", note="pip install 'jaxmpc[bench]'")
-                continue
-            times, errors = [], []
-            for truth, y, u in logs:
-                begin = time.perf_counter()
-                found = method(y, u, LENGTH)
-                times.append(time.perf_counter() - begin)
-                errors.append(float((np.abs(found - truth).max(axis=1) / np.abs(truth).max(axis=1)).max()))
+
+        def judged(found: list[np.ndarray], logs=logs):
+            errors = [
+                float((np.abs(steps - truth).max(axis=1) / np.abs(truth).max(axis=1)).max())
+                for steps, (truth, _, _) in zip(found, logs, strict=True)
+            ]
             note = (
                 f"error of the worst coefficient, median {np.median(errors):.2g}; {COUNT} samples, N {LENGTH}"
             )
-            yield timed(row, times, errors, solved=None, counts=True, note=note)
+            return errors, note
+
+        yield from compared(kind, methods, [(y, u) for _, y, u in logs], LENGTH, judged)
     yield from published(context, methods)
 
 

@@ -11,7 +11,7 @@ import hashlib
 import time
 import tomllib
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -54,24 +54,41 @@ def published(context: Context, methods: dict[str, Method | None]) -> Iterator[R
                 name=f"identification, {data.name}", status="missing", note=f"{why}; --data FOLDER has it"
             )
             continue
-        for name, method in methods.items():
-            row = f"identification, {data.name}: {name}"
-            if method is None:
-                yield Row(name=row, status="missing", note="pip install 'jaxmpc[bench]'")
-                continue
-            times, fits = [], []
-            u, half = numbers[:, slice(*data.inputs)], len(numbers) // 2
-            for y in numbers[:, slice(*data.outputs)].T:
-                begin = time.perf_counter()
-                found = method(y[:half], u[:half], data.lags)
-                times.append(time.perf_counter() - begin)
-                fits.append(foreseen(found, y, u, half))
+        u, half = numbers[:, slice(*data.inputs)], len(numbers) // 2
+        outputs = numbers[:, slice(*data.outputs)].T
+
+        def judged(found: list[np.ndarray], data=data, u=u, outputs=outputs, half=half):
+            fits = [foreseen(steps, y, u, half) for steps, y in zip(found, outputs, strict=True)]
             note = (
                 f"{np.mean(fits):.1f} % of the second half is foreseen from the inputs"
                 f"{f', mean of {len(fits)} CVs ({min(fits):.0f} to {max(fits):.0f} %)' if len(fits) > 1 else ''}; "
                 f"{half} samples, N {data.lags}"
             )
-            yield timed(row, times, [np.nan] * len(times), solved=None, counts=True, note=note)
+            return [np.nan] * len(fits), note
+
+        yield from compared(data.name, methods, [(y[:half], u[:half]) for y in outputs], data.lags, judged)
+
+
+def compared(
+    data: str,
+    methods: Mapping[str, Method | None],
+    logs: Sequence[tuple[Float[np.ndarray, " sample"], Float[np.ndarray, "sample input"]]],
+    lags: int,
+    judged: Callable[[list[np.ndarray]], tuple[list[float], str]],
+) -> Iterator[Row]:
+    """A row per method, which makes step responses of every log; `judged` gives their errors and a note."""
+    for name, method in methods.items():
+        row = f"identification, {data}: {name}"
+        if method is None:
+            yield Row(name=row, status="missing", note="pip install 'jaxmpc[bench]'")
+            continue
+        times, found = [], []
+        for y, u in logs:
+            begin = time.perf_counter()
+            found.append(method(y, u, lags))
+            times.append(time.perf_counter() - begin)
+        errors, note = judged(found)
+        yield timed(row, times, errors, solved=None, counts=True, note=note)
 
 
 def foreseen(
