@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxmpc.check import is_number
+from jaxmpc.check import among, is_number
 from jaxmpc.controller.checkpoint import save_controller
 from jaxmpc.controller.controller import Controller
-from jaxmpc.errors import InputError, MissingToolError, near
+from jaxmpc.errors import InputError, MissingToolError
 from jaxmpc.files import check_target, write_atomically
 
 PROGRAM = Path(__file__).with_name("controller_slave.py")
@@ -78,8 +78,7 @@ def _checked_start(controller: Controller, given: dict[str, float]) -> dict[str,
     structure, tuning = controller.structure, controller.tuning
     names = structure.cv_names + structure.mv_names
     for name, value in given.items():
-        if name not in names:
-            raise InputError("start", name, f"one of {', '.join(names)}", near(name, names))
+        among("start", name, names)
         if not is_number(value):
             raise InputError(f"start.{name}", value, "a finite number [unit of the variable]")
     rest = np.clip(0.0, np.asarray(tuning.mv_low), np.asarray(tuning.mv_high)).tolist()

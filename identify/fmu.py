@@ -18,8 +18,8 @@ from jaxtyping import Float
 
 from identify.fmu_description import NUMBERS, FmuDescription, FmuVariable, Value
 from identify.fmu_process import TIME_LIMIT, FmuProcess
-from jaxmpc.check import is_number
-from jaxmpc.errors import InputError, PlantError, near
+from jaxmpc.check import among, is_number
+from jaxmpc.errors import InputError, PlantError
 from jaxmpc.process.actuator import Actuator
 from jaxmpc.process.plant import Outputs, Parameter, Signals, checked_parameters
 
@@ -155,9 +155,7 @@ class FmuPlant:
         self._actuators = [_actuator(name, given) for name, given in actuators.items()]
         for field, given in (("working_point", working_point), ("positions", positions)):
             for name in given:
-                if name not in actuators:
-                    expected = f"one of the MVs {', '.join(actuators)}"
-                    raise InputError(f"plant.{field}", name, expected, near(name, actuators))
+                among(f"plant.{field}", name, actuators, "one of the MVs")
         self.working_point = np.array(
             [
                 self._rest("plant.working_point", name, found, working_point)

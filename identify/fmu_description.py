@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterable
 from typing import Any
 
-from jaxmpc.check import is_number
+from jaxmpc.check import among, is_number
 from jaxmpc.errors import InputError, near
 
 Value = float | int | bool | str
@@ -95,8 +95,7 @@ class FmuVariable:
         if self.type == "String" and isinstance(value, str):
             return value
         if self.type == "Enumeration" and isinstance(value, str):
-            if value not in self.items:
-                raise InputError(field, value, f"one of {', '.join(self.items)}", near(value, self.items))
+            among(field, value, self.items)
             return self.items[value]
         if self.type == "Boolean" and isinstance(value, bool):
             return value

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from identify.fmu_description import Value
 from identify.fmu_steps import StepTests
-from jaxmpc.check import is_number
+from jaxmpc.check import among, is_number
 from jaxmpc.controller.schedule import ModelSchedule, make_schedule
-from jaxmpc.errors import InputError, near
+from jaxmpc.errors import InputError
 from jaxmpc.model.identification import Identification
 
 
@@ -36,8 +36,7 @@ def identify_fmu_schedule(
     if len(at) not in (1, 2):
         raise InputError("--at", list(at), f"values of one or two of the MVs {', '.join(mvs)}")
     for mv, values in at.items():
-        if mv not in mvs:
-            raise InputError("--at", mv, f"one of the MVs {', '.join(mvs)}", near(mv, mvs))
+        among("--at", mv, mvs, "one of the MVs")
         if len(values) < 2 or len(set(values)) != len(values):
             raise InputError(f"--at {mv}", list(values), "two or more distinct values")
     places = [dict(zip(at, values, strict=True)) for values in itertools.product(*at.values())]

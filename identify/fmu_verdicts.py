@@ -209,7 +209,7 @@ def movement_of(cv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     half = len(cv) // 2
     movement = np.abs(cv[half:].mean(axis=0) - cv[:half].mean(axis=0))
     noise = np.diff(cv, n=2, axis=0).std(axis=0) / math.sqrt(6)
-    return movement, noise * 2 / math.sqrt(len(cv)) / 2
+    return movement, noise / math.sqrt(len(cv))
 
 
 def _moving(s: np.ndarray, row: Settling, dt: float, per: str, error: float) -> tuple[bool, str]:

@@ -17,6 +17,7 @@ import numpy as np
 
 from identify.step_test import identify_step_response
 from identify.working_point import facts_of
+from jaxmpc.check import among
 from jaxmpc.errors import InputError, near
 from jaxmpc.model.step_response import StepResponseModel, make_model
 from jaxmpc.process.actuator import Actuator
@@ -48,8 +49,7 @@ def open_plant(
             another sampling interval, or without its disturbances.
     """
     name = name or next(iter(process.plants))
-    if name not in process.plants:
-        raise InputError("plant", name, f"one of {', '.join(process.plants)}", near(name, process.plants))
+    among("plant", name, process.plants)
     source, path = process.plants[name], f"plants.{name}"
     plant = _made(process, source, path, process.actuators(actual))
     if abs(plant.dt - process.dt) > 1e-9 * process.dt:
@@ -58,10 +58,7 @@ def open_plant(
         )
     own = disturbances_of(plant)
     for i, name in enumerate(process.disturbance_names):
-        if name not in own:
-            raise InputError(
-                f"disturbance[{i}].name", name, f"a disturbance of {path}: {', '.join(own)}", near(name, own)
-            )
+        among(f"disturbance[{i}].name", name, own, f"a disturbance of {path}:")
     return plant.replaced(parameters) if parameters else plant
 
 

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 from identify.names import legal_names
-from jaxmpc.check import LARGEST, is_count, is_number, require
-from jaxmpc.errors import InputError, near
+from jaxmpc.check import LARGEST, among, is_count, is_number, require
+from jaxmpc.errors import InputError
 from jaxmpc.model.step_response import StepResponseModel, make_model
 
 LONGEST = 100_000  # coefficients of a response, beyond which a number cannot be meant
@@ -280,5 +280,4 @@ def chosen(option: str, asked: Sequence[str], known: Iterable[str]) -> None:
     """Refuse names of an option that the file does not have."""
     known = list(known)
     for name in asked:
-        if name not in known:
-            raise InputError(option, name, f"one of {', '.join(known)}", near(name, known))
+        among(option, name, known)

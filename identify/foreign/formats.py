@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from identify.foreign import arrays, lightweight, mdf, neqsim, septic, tables
 from identify.foreign.common import Asked, Imported, read_text
-from jaxmpc.check import require
-from jaxmpc.errors import InputError, near
+from jaxmpc.check import among, require
+from jaxmpc.errors import InputError
 from jaxmpc.files import check_folder, check_target, read_json
 from jaxmpc.model.step_response import StepResponseModel
 
@@ -62,8 +62,7 @@ def import_model(given: Sequence[Path], form: str = "", asked: Asked | None = No
     for path in given:
         require(path.exists(), "FILE", str(path), "a file or a folder that is there")
     form = form or recognised(given)
-    if form not in FORMATS:
-        raise InputError("--from", form, f"one of {', '.join(FORMATS)}", near(form, FORMATS))
+    among("--from", form, FORMATS)
     single = not FORMATS[form].folder
     if single and (len(given) != 1 or given[0].is_dir()):
         raise InputError("FILE", [str(path) for path in given], f"one file of the format {form}")
@@ -117,9 +116,9 @@ def export_model(
     Raises:
         InputError: for a format that is not written, and a target that cannot be.
     """
-    known = FORMATS.get(form)
-    if known is None or known.write is None:
-        raise InputError("--to", form, f"one of {', '.join(WRITTEN)}", near(form, WRITTEN))
+    among("--to", form, WRITTEN)
+    known = FORMATS[form]
+    assert known.write is not None  # of what `WRITTEN` names
     if known.folder:
         require(not out.is_file(), "--out", str(out), "a folder")
         check_folder("--out", out)

@@ -8,8 +8,7 @@ from pathlib import Path
 from identify.foreign import cnfg
 from identify.foreign.cnfg import Block
 from identify.foreign.septic_meaning import APPLICATIONS, meanings_of, refuse_twice
-from jaxmpc.check import require
-from jaxmpc.errors import near
+from jaxmpc.check import among, require
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +49,7 @@ def application_of(path: Path, name: str = "") -> Application:
         hint = "The configuration has several"
         require(len(heads) == 1, "--application", None, f"one of {', '.join(listed)}", hint)
         name = listed[0]
-    require(name in listed, "--application", name, f"one of {', '.join(listed)}", near(name, listed))
+    among("--application", name, listed)
     head = heads[listed.index(name)]
     begin = blocks.index(head)
     ends = [

@@ -23,32 +23,14 @@ WORDS = (
     "nan na n/a null none bad - -- --- ? no_data nodata invalid questionable uncertain offline error shutdown"
 )
 SENTENCES = (
-    *(
-        "no data",
-        "bad input",
-        "i/o timeout",
-        "not connect",
-        "scan off",
-        "pt created",
-        "out of serv",
-        "calc failed",
-    ),
-    *(
-        "arc off-line",
-        "intf shut",
-        "comm fail",
-        "over range",
-        "under range",
-        "no sample",
-        "equip fail",
-        "no result",
-    ),
-    *("configure", "#n/a", "#value!", "#ref!", "#div/0!", "#num!", "<null>"),
+    "no data, bad input, i/o timeout, not connect, scan off, pt created, out of serv, calc failed, arc off-line, intf shut, "
+    "comm fail, over range, under range, no sample, equip fail, no result, configure, #n/a, #value!, #ref!, #div/0!, #num!, "
+    "<null>"
 )
 CODED = re.compile(r"^\[-\d+\]")  # an error number and words of it
 PAIRS = ("off on", "false true", "no yes", "closed open", "stopped running", "stop run", "inactive active")
 TRUTHS = {word: float(k) for pair in PAIRS for k, word in enumerate(pair.split())}
-MISSING = frozenset(("", *WORDS.split(), *SENTENCES))
+MISSING = frozenset(("", *WORDS.split(), *SENTENCES.split(", ")))
 UNIT = re.compile(r"^(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))$")  # NAME [UNIT] or NAME (UNIT)
 GROUPED = re.compile(r"^[+-]?\d{1,3}(\.\d{3})*(,\d+)?([eE][+-]?\d+)?$|^[+-]?\d*,?\d+([eE][+-]?\d+)?$")
 

@@ -15,8 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float
 
-from jaxmpc.controller.batch import Batch, one_lane, traced
-from jaxmpc.controller.batch import Controllers as Controllers
+from jaxmpc.controller.batch import Batch, Controllers, one_lane, traced
 from jaxmpc.controller.core import Core
 from jaxmpc.controller.sample import checked, checked_off, checked_start
 from jaxmpc.controller.state import ControllerState, StepInfo

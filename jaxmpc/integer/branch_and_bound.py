@@ -135,7 +135,6 @@ class _Tree:
             search.offer(result, lane)
 
     # ---- what a relaxed node proves
-
     def _reduced(self, node: Node) -> Node | None:
         """The node without what its prices exclude, None if that is everything."""
         search, model = self.search, node.model

@@ -10,8 +10,9 @@ import scipy.optimize
 import scipy.sparse as sp
 
 from jaxmpc import html, status
+from jaxmpc.controller.batch import Controllers
 from jaxmpc.controller.case import case_to_dict, make_case, plan_to_dict
-from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.plan import Planner
 from jaxmpc.errors import InputError
 from jaxmpc.integer.chain import chains_of

@@ -7,8 +7,9 @@ import jax
 import numpy as np
 import pytest
 
+from jaxmpc.controller.batch import Controllers
 from jaxmpc.controller.checkpoint import load_controller, save_controller
-from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.plan import solve_plan
 from jaxmpc.controller.schedule import make_schedule
 from jaxmpc.errors import InputError

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from jaxmpc import status
+from jaxmpc.controller.batch import Controllers
 from jaxmpc.controller.case import case_to_dict, make_case
-from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.plan import Planner, solve_plan
 from jaxmpc.errors import InputError
 from jaxmpc.loop.events import Event

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxmpc.controller.controller import Controllers
+from jaxmpc.controller.batch import Controllers
 from jaxmpc.controller.measurement import (
     FROZEN,
     GOOD,

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.batch import Controllers
+from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.plan import Planner
 from jaxmpc.errors import InputError
 from tests.five_controllers import KINDS, SETPOINT, START, stepped, tuned

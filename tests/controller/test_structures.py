@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from jaxmpc import status
-from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.batch import Controllers
+from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
 from jaxmpc.loop.simulate import simulate, simulate_batches
 from jaxmpc.process.reference import Reference

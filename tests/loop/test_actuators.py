@@ -7,7 +7,8 @@ import pytest
 
 from identify.step_test import identify_step_response
 from jaxmpc import status
-from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.batch import Controllers
+from jaxmpc.controller.controller import Controller
 from jaxmpc.loop.simulate import simulate, simulate_batch
 from jaxmpc.process.reference import Reference
 from jaxmpc.process.well.plant import WellPlant

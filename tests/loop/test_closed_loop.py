@@ -12,7 +12,8 @@ import pytest
 
 from identify.step_test import identify_step_response
 from jaxmpc import status
-from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.batch import Controllers
+from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.measurement import MISSING, OUTSIDE, SensorFault, fault_errors
 from jaxmpc.errors import InputError
 from jaxmpc.loop.compiled import _Run
@@ -238,7 +239,7 @@ import sys
 import jax
 import numpy as np
 from jaxmpc import Reference, StepResponseModel, WellPlant
-from jaxmpc.controller.controller import Controllers
+from jaxmpc.controller.batch import Controllers
 from jaxmpc.loop.simulate import simulate_batches
 from studies.thesis.well import WELL
 assert jax.device_count() == 2

@@ -6,7 +6,8 @@ import pytest
 from identify.step_test import identify_step_response
 from jaxmpc import status
 from jaxmpc.controller import measurement
-from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.batch import Controllers
+from jaxmpc.controller.controller import Controller
 from jaxmpc.loop import compiled
 from jaxmpc.loop.simulate import simulate, simulate_batch
 from jaxmpc.loop.trajectory import RECORDABLE

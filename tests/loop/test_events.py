@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from jaxmpc import status
-from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.batch import Controllers
+from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.core import without
 from jaxmpc.controller.measurement import SensorFault, fault_errors
 from jaxmpc.errors import InputError

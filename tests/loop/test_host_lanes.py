@@ -7,7 +7,8 @@ import pytest
 
 from identify.fmu import FmuPlant
 from jaxmpc import status
-from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.batch import Controllers
+from jaxmpc.controller.controller import Controller
 from jaxmpc.controller.measurement import MISSING
 from jaxmpc.errors import PlantError
 from jaxmpc.loop import host_lanes

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxmpc.controller.controller import Controller, Controllers
+from jaxmpc.controller.batch import Controllers
+from jaxmpc.controller.controller import Controller
 from jaxmpc.errors import InputError
 from jaxmpc.loop.simulate import simulate, simulate_batch
 from jaxmpc.model.step_response import make_model
